@@ -1,7 +1,7 @@
 """Pipeline from posed images to a relightable asset.
 
-One function per stage, :func:`reconstruct`, which runs them, and :func:`reconstruct_folder`, which reads an object
-folder and writes the result.
+One function per stage; :func:`reconstruct` runs all stages, and :func:`reconstruct_folder` reads an object folder and
+writes the result.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class NoSurface(InputError):
 def encode(model: Network, prepared: Prepared, *, background: bool = False) -> Field:
     """Runs the network on the views of one object.
 
-    background: whether the illumination branch of a :class:`~reli3d.nn.model.Reconstructor` sees the background.
+    background: whether the illumination branch of a :class:`~reli3d.nn.model.Reconstructor` reads the background.
     """
     batch = prepared.batch
     if isinstance(model, LocalReconstructor):
@@ -167,7 +167,7 @@ def texture(
 ) -> tuple[Mesh, TextureSet]:
     """``mesh`` with UV, normals and tangents, and its textures of ``size`` texels per side; the faces keep their order.
 
-    scene: rays against ``mesh``, for a network that uses the visibility of points in the views; otherwise None.  uv:
+    scene: rays against ``mesh``, for networks that use the visibility of points in the views; otherwise None.  uv:
     ``project`` or ``xatlas``.
     """
     maps = field.maps
@@ -206,12 +206,12 @@ def texture(
 
 
 def light(field: Field) -> Environment:
-    """The predicted environment, in the axes of the model frame."""
+    """The predicted environment, in the model frame."""
     return Environment(field.radiance_map().contiguous())
 
 
 def match_brightness(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
-    """``asset`` with base color and lighting rescaled to reproduce the colors of the views of ``maps``.
+    """``asset`` with base color and lighting rescaled to match the colors of the views in ``maps``.
 
     Images determine only the product of albedo and lighting; see :mod:`reli3d.render.exposure`.
     """
@@ -278,18 +278,18 @@ class ReconstructOptions:
     """Options of :func:`reconstruct`.
 
     texture_size: texels per side, 256 to 4096.  resolution: cubes per side of the FlexiCubes grid, 16 to 256; None: the
-    value of the network's preset.  normalization: how the object is placed in the cube of the network.  ``hull``: the
-    bounding box of the visual hull is centered and its longest side scaled to 1.  ``none``: poses as stored.  ``auto``:
-    by ``views.object_box`` if there is one; else poses as stored if the visual hull lies in the cube, near its center
-    and not much smaller (:func:`~reli3d.views.normalize.normalize`); else ``hull``.  A
-    :class:`~reli3d.views.similarity.Similarity` is used as the map from the input to the model frame.  If it is not
-    given (Python None): ``auto`` for the bundled network, ``none`` for the published one.  up: axis of the cameras'
-    world frame that becomes +Y, ``x``, ``y``, ``z`` or one with a minus sign.  uv: method of unwrapping, ``project`` or
-    ``xatlas``.  hero: index of the reference view. background: image region that the lighting estimate reads,
+    preset's value.  normalization: how the object is placed in the network's cube.  ``hull``: the bounding box of the
+    visual hull is centered and its longest side scaled to 1.  ``none``: poses as stored.  ``auto``: as ``hull`` with
+    the box ``views.object_box`` if there is one; otherwise poses as stored if the visual hull lies in the cube, near
+    its center and not much smaller (:func:`~reli3d.views.normalize.normalize`); otherwise ``hull``.  A
+    :class:`~reli3d.views.similarity.Similarity`: the transform from the input to the model frame.  None (not the
+    string): ``auto`` for the bundled network, ``none`` for the published one.  up: axis of the cameras' world frame
+    that becomes +Y: ``x``, ``y`` or ``z``, optionally with a minus sign.  uv: unwrapping method, ``project`` or
+    ``xatlas``.  hero: index of the reference view.  background: image region that the lighting estimate reads,
     ``masked`` (the object only), ``visible`` (the background too) or ``auto`` (``visible`` if all views have a
     background and the weights were trained with it, else ``masked``).  symmetry: ``auto`` completes objects with a
-    detected mirror plane (bundled network only), or ``off``. Raises InputError for a wrong value; ``hero`` is checked
-    when views are given.
+    detected mirror plane (bundled network only), or ``off``.  Raises InputError for an invalid value; ``hero`` is
+    checked when views are given.
 
     >>> options = reli3d.ReconstructOptions(texture_size=512, symmetry="off")
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe"), options=options)
@@ -323,7 +323,7 @@ DEFAULT = ReconstructOptions()
 
 @dataclass(frozen=True)
 class Placed:
-    """Views in the order of the network's input, and the transforms to the model frame and to that of the asset."""
+    """Views in network input order, and the transforms to the model frame and to the asset frame."""
 
     views: Views
     model_from_input: Similarity
@@ -332,7 +332,7 @@ class Placed:
 
 @full_precision
 def place(views: Views, preset: Preset | LocalPreset, options: ReconstructOptions = DEFAULT) -> Placed:
-    """The views with the reference view first, and the transforms to the frames of model and asset.
+    """The views with the reference view first, and the transforms to the model frame and to the asset frame.
 
     If poses are used as stored by default and the object does not fit the model's cube, the views get a note.
     """
@@ -354,12 +354,12 @@ def reconstruct(views: Views, *, weights: str | Network = "small", device: str =
 
     views: 1 to 16, see :func:`reli3d.load_views`.  weights: ``small`` (the bundled network), ``official`` (the
     published ReLi3D network, after ``reli3d download``), the path of a safetensors file, or a loaded network.  device:
-    ``cpu`` or ``cuda``, ignored for a loaded network; the asset is on the device of the network.  options: see
+    ``cpu`` or ``cuda``, ignored for a loaded network; the asset is on the network's device.  options: see
     :class:`ReconstructOptions`.  watch: receives the seconds of each stage.
 
     The asset is in the frame of the cameras, in their units, with ``options.up`` as +Y.  Deterministic.  Runs under
     ``torch.no_grad``, so nothing has gradients; :func:`refine` optimizes the result.  Raises TypeError unless ``views``
-    are Views; InputError if the masks have no common object, or for weights that cannot be read; NoSurface, an
+    are Views; InputError if the masks' visual hull is empty, or for weights that cannot be read; NoSurface, an
     InputError, if the network predicts no surface.  Source: the ReLi3D paper, ICLR 2026.
 
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe", views=4))
@@ -411,16 +411,17 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
     """Refines mesh, maps and lighting of ``asset`` by inverse rendering of ``views``.
 
-    Some views are held out to judge the fit: none of 1 or 2 views, one of 3 to 11, two of 12 or more.  On the fitted
-    surface, material (base color, roughness, metallic, shading normals) and lighting are each blended with their start
-    values: weight 1 is the fit, 0 the start, 1/2 halfway.  Combinations are tried in a fixed order, from the complete
-    fit to the surface alone.  The first one is returned whose mean PSNR in the fitted, the held-out and all views is
-    not lower than that of the start, within a small tolerance.  If there is none, ``asset`` is returned.
+    To judge the fit, some views are held out: none of 1 or 2, one of 3 to 11, two of 12 or more.  On the fitted
+    surface, material (base color, roughness, metallic, shading normals) and lighting are each blended between their
+    initial (weight 0) and fitted (weight 1) values, with weight 1, 1/2 or 0.  Weights are tried in a fixed order, from
+    the complete fit to the fitted surface alone.  The result is the first blend whose mean PSNR over the fitted, the
+    held-out and all views is not lower than the initial PSNR, within a small tolerance; if there is none, it is
+    ``asset``.
 
-    views: any number, in the frame of ``asset``: that of the cameras unless ``ReconstructOptions.up`` changed it.
-    seconds, steps: duration of the optimization, one of the two; ``steps`` is reproducible.  options: of
-    :func:`reli3d.fit.refine.refine`.  Returns a new asset without gradients.  Raises TypeError for a wrong type,
-    ValueError unless exactly one of ``seconds`` and ``steps`` is given.
+    views: any number, in the frame of ``asset``, which is the cameras' frame unless ``ReconstructOptions.up`` changed
+    it.  seconds, steps: duration of the optimization, exactly one of the two; with ``steps`` the result is
+    reproducible.  options: see :func:`reli3d.fit.refine.refine`.  Returns a new asset without gradients.  Raises
+    TypeError for a wrong type, ValueError unless exactly one of ``seconds`` and ``steps`` is given.
 
     >>> views = reli3d.load_views("photos/shoe", every=True)
     >>> asset = reli3d.refine(reli3d.reconstruct(views.taken()), views, seconds=60)
@@ -430,7 +431,7 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
 
 @full_precision
 def refined(asset: Asset, views: Views, **options) -> Refinement:
-    """As :func:`refine`; returns the asset with the record of the fit."""
+    """As :func:`refine`; returns the asset and the record of the fit."""
     from reli3d.fit import refine as fit  # imported where it is used: it loads kernels of its own
 
     device = asset.mesh.vertices.device
@@ -452,9 +453,9 @@ class FolderOptions:
     """Which images of a folder :func:`reconstruct_folder` reads, and whether it refines the result.
 
     views, masks, remove_background: as in :func:`~reli3d.views.folder.load_views`.  budget: ``seconds`` or ``steps`` of
-    a refinement with all images; empty: none.  cameras: also optimize the cameras.  interrupt: as in
-    :func:`reli3d.fit.refine.refine`.  light: ``object``, ``camera`` or ``per-group``, a lighting for each sub-folder of
-    images; None: from the folder.
+    a refinement on all images; empty: no refinement.  cameras: also optimize the cameras.  interrupt: as in
+    :func:`reli3d.fit.refine.refine`.  light: ``object``, ``camera`` or ``per-group`` (one lighting per sub-folder of
+    images); None: read from the folder.
     """
 
     views: int | None = None
@@ -477,7 +478,7 @@ class FolderOptions:
         )
 
     def lighting(self, views: Views) -> str | list[str]:
-        """``light`` of a refinement.  Raises InputError for ``per-group`` without two sub-folders."""
+        """Argument ``light`` of a refinement.  Raises InputError for ``per-group`` without two sub-folders."""
         if self.light != "per-group":
             return self.light or views.lighting
         groups = [name.rpartition("/")[0] for name in views.names]

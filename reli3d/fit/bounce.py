@@ -24,10 +24,10 @@ def gathered(mesh: Mesh, images: InputImages, *, seed: int) -> Tensor:
     """Cosine-weighted mean ``(V, 3)`` of the radiance that each vertex receives from the mesh itself.
 
     Final gathering with one bounce: a surface point is taken as Lambertian, and its outgoing radiance, which includes
-    all bounces, is the mean color of the images in which it is visible.  Points that no camera sees have the mean of
-    the others.  Faces emit on both sides.
+    all bounces, is the mean color of the images in which it is visible.  Points that no camera sees get the mean of the
+    other points.  Faces emit on both sides.
 
-    mesh: with normals, in the fit's box [-1, 1]^3.  images: those whose colors may be used; exposures count as 1.
+    mesh: with normals, in the fit's box [-1, 1]^3.  images: those whose colors may be used; exposures are taken as 1.
     seed: of the ray directions.  No gradient.  Raises ValueError without normals.
     """
     position, normal = mesh.vertices, present("mesh.normals", mesh.normals)
@@ -62,5 +62,5 @@ def _leaving(position: Tensor, normal: Tensor, scene: RayScene, images: InputIma
 
 
 def reflected(points: SurfacePoints, received: Tensor) -> Tensor:
-    """Radiance ``(N, 3)`` that Lambertian points reflect of ``received (N, 3)``, of :func:`gathered`."""
+    """Radiance ``(N, 3)`` reflected by Lambertian points that receive ``received (N, 3)``, from :func:`gathered`."""
     return points.base_color * (1.0 - points.metallic[:, None]) * received

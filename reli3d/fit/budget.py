@@ -12,10 +12,10 @@ from tqdm import tqdm
 
 @dataclass
 class Budget:
-    """Seconds or steps for the parts of a fit; ``steps`` alone gives the same result on every run.
+    """Budget in seconds or steps for the parts of a fit; only ``steps`` gives the same result on every run.
 
     curve: one entry every ``CURVE_STEPS`` steps, ``{part, step, seconds, loss}``.  interrupt: called before every
-    step.  interrupted: whether it returned True; then the running part ends and later ones take no step.
+    step.  interrupted: whether ``interrupt`` returned True; the current part then ends, and later parts take no step.
     """
 
     seconds: float | None = None
@@ -38,9 +38,9 @@ class Budget:
             raise ValueError(f"steps: expected at least 1, got {self.steps}")
 
     def part(self, name: str, until: float) -> Iterator[tuple[int, float]]:
-        """``(step, progress)`` with progress in [0, 1), until ``until`` of the whole budget is used.
+        """Yields ``(step, progress)``, progress in [0, 1), until the fraction ``until`` of the whole budget is used.
 
-        With seconds the progress is that of the clock.  A part that would begin after its end takes no step.
+        With a budget in seconds, progress follows the clock.  A part that would begin after its end takes no step.
         """
         started = time.perf_counter() - self.began
         done = sum(self.counts.values())
@@ -67,7 +67,7 @@ class Budget:
             self.counts[name] = count
 
     def record(self, name: str, step: int, loss: float) -> None:
-        """Record the loss of a step in the curve and on the progress bar."""
+        """Records the loss of a step in the curve and on the progress bar."""
         if step % self.CURVE_STEPS == 0:
             seconds = round(time.perf_counter() - self.began, 3)
             self.curve.append({"part": name, "step": step, "seconds": seconds, "loss": round(loss, 6)})
@@ -78,6 +78,6 @@ class Budget:
 
 
 def progress_bar(budget_total: float, unit: str) -> tqdm:
-    """A bar on stderr over seconds or steps."""
+    """Progress bar on stderr, in seconds or steps."""
     layout = "refine: {bar:20} {n:.0f}/{total:.0f} {unit} {postfix} {remaining}"
     return tqdm(total=budget_total, unit=unit, file=sys.stderr, bar_format=layout, leave=False, disable=None)

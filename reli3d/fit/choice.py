@@ -34,8 +34,8 @@ SURFACE_TOLERANCES_DB = (0.1, 0.3, 0.05)
 class Parts:
     """Blend weights between start (0) and fit (1).
 
-    surface: 0 or 1.  material: factor of the changes of the material's logits and of the bend of the normals.  light:
-    factor of the changes of log radiance.
+    surface: 0 or 1.  material: factor on the changes of material logits and on the bend of the normals.  light: factor
+    on the changes of log radiance.
     """
 
     surface: float
@@ -60,9 +60,9 @@ MIN_VIEWS_FULL_WEIGHT = (
 class Fitted:
     """A start and the result of a fit.
 
-    first: the start.  surface: the new surface with the maps and lighting of the start; ``first`` where it did not
-    move.  received: ``(V, 3)``, of :func:`~reli3d.fit.bounce.gathered` at the vertices of ``surface``. images: with
-    corrected cameras.
+    first: the start.  surface: the fitted surface with the start's maps and lighting; ``first`` if the surface was not
+    fitted.  received: ``(V, 3)``, from :func:`~reli3d.fit.bounce.gathered` at the vertices of ``surface``.  images:
+    with corrected cameras.
     """
 
     first: Asset
@@ -90,9 +90,9 @@ class Fitted:
 class ViewRenderer:
     """Renders one surface in all views at low resolution and compares with the input images; rays are traced once.
 
-    received: ``(vertices, 3)``, of :func:`~reli3d.fit.bounce.gathered`.  For V views: ``target (V, S, S, 3)`` display
+    received: ``(vertices, 3)``, from :func:`~reli3d.fit.bounce.gathered`.  For V views: ``target (V, S, S, 3)`` display
     values on white; ``rays``: hit mask ``(S, S)``, faces ``(N,)``, barycentrics ``(N, 2)`` and unit directions to the
-    eye ``(N, 3)``; ``inside (N,)``: whether the hit lies inside the mask by a pixel.
+    eye ``(N, 3)``; ``inside (N,)``: whether the hit is at least one pixel inside the mask.
     """
 
     @torch.no_grad()
@@ -111,8 +111,10 @@ class ViewRenderer:
 
     @torch.no_grad()
     def lit(self, asset: Asset, lights: Lights | None = None) -> list[tuple[Tensor, Tensor]]:
-        """For each view, linear radiance ``(N, 3)`` by ``lights``, by default that of ``asset``, which has this
-        surface, and by one-bounce interreflection ``(N, 3)``.  The random numbers depend on the view alone.
+        """Per view, linear radiance ``(N, 3)`` from direct light and from one-bounce interreflection.
+
+        asset: with the same surface.  lights: None: the environment of ``asset``.  Random numbers depend only on the
+        view.
         """
         lit = []
         for view, (_, face, bary, wo) in enumerate(self.rays):
@@ -134,8 +136,10 @@ class ViewRenderer:
 
     @torch.no_grad()
     def light_scale(self, lit: list[tuple[Tensor, Tensor]], views: list[int]) -> float:
-        """The one of ``LIGHT_SCALES`` with the least error in ``views``, over pixels inside the masks: pixels of the
-        rim contain background."""
+        """Value of ``LIGHT_SCALES`` with the least error in ``views``, over pixels inside the masks.
+
+        Pixels at the rim are excluded because they contain background.
+        """
         got, bounced = (torch.cat([lit[view][k][self.inside[view]] for view in views]) for k in range(2))
         target = torch.cat([self.target[view][self.rays[view][0]][self.inside[view]] for view in views])
         if not len(got):
@@ -148,14 +152,17 @@ class ViewRenderer:
 
 
 def view_errors(asset: Asset, received: Tensor, images: InputImages) -> Tensor:
-    """Mean squared display error ``(V,)`` of renderings on white, at pixel centers, with the asset's environment
-    and one-bounce interreflection: ``received``, of :func:`~reli3d.fit.bounce.gathered` at its vertices."""
+    """Mean squared display error ``(V,)`` of renderings on white, sampled at pixel centers.
+
+    Lighting: the asset's environment and one-bounce interreflection.  received: from
+    :func:`~reli3d.fit.bounce.gathered` at the asset's vertices.
+    """
     renderer = ViewRenderer(asset, received, images)
     return renderer.errors(renderer.lit(asset))
 
 
 def mean_psnr(errors: Tensor) -> float:
-    """Mean PSNR over views, NaN of none."""
+    """Mean PSNR over views; NaN without views."""
     return float((-10.0 * errors.clamp(min=1e-9).log10()).mean()) if len(errors) else math.nan
 
 
@@ -163,14 +170,14 @@ def mean_psnr(errors: Tensor) -> float:
 def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> tuple[Asset, Parts, Tensor]:
     """Selects the first of ``CANDIDATES`` that is no worse than the start; returns asset, weights, errors ``(V,)``.
 
-    A candidate is accepted if its mean PSNR is within ``PSNR_TOLERANCE_DB`` of the start's on the ``used`` views, on
-    the ``held`` ones and on all; within ``SURFACE_TOLERANCES_DB`` if only the surface changes.  With fewer than
-    ``MIN_VIEWS_FULL_WEIGHT`` input views, larger weights are not tried.  Without an accepted candidate the start is
-    returned.
+    A candidate is accepted if its mean PSNR is at most ``PSNR_TOLERANCE_DB`` below the start's on the ``used`` views,
+    on the ``held`` views and on all views; the limits are ``SURFACE_TOLERANCES_DB`` if only the surface changes.  With
+    fewer than ``MIN_VIEWS_FULL_WEIGHT`` used views, the weight of the material is at most 1/2, as is that of the
+    lighting if a view is held out.  If no candidate is accepted, the start is returned.
 
-    used, held: indices of views.  before: errors ``(V,)`` of the start.  The scale of each candidate's light is fitted
-    to the used views, because the fit underestimates it: its loss uses the tangent of the display curve, which rises
-    faster than the curve, and a blend of log radiance is darker than the blend of radiance.
+    used, held: indices of views.  before: errors ``(V,)`` of the start.  Each candidate's light scale is fitted to the
+    used views, because the fit underestimates the lighting: the loss uses the tangent of the display curve, which rises
+    faster than the curve, and a blend of log radiance is darker than a blend of radiance.
     """
     renderer = ViewRenderer(fitted.surface, fitted.received, fitted.images)
     moved = float(fitted.surface is not fitted.first)

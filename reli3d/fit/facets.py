@@ -15,8 +15,10 @@ VERTEX_ITERATIONS = 20  # that move the vertices towards their faces' planes
 
 
 def neighbor_faces(faces: Tensor) -> Tensor:
-    """``(F, 3)`` int64: the face across each edge ``(0, 1), (1, 2), (2, 0)`` of ``faces (F, 3)``, the face itself where
-    there is not exactly one."""
+    """Face ``(F, 3)`` int64 across each edge ``(0, 1), (1, 2), (2, 0)`` of ``faces (F, 3)``.
+
+    The face itself where there is not exactly one face across the edge.
+    """
     across = torch.from_numpy(face_neighbors(faces.cpu().numpy())).to(faces.device).long()
     own = torch.arange(len(faces), device=faces.device, dtype=torch.int64)[:, None]
     return torch.where(across < 0, own, across)
@@ -28,10 +30,10 @@ def flattened(
 ) -> Mesh:
     """``mesh`` denoised by bilateral filtering of its face normals; vertices and faces only.
 
-    The normals are averaged over neighbors with weights of area and of the distance of normals (Zheng, Fu, Au and Tai
+    The normals are averaged over neighbors, weighted by area and by the distance between normals (Zheng, Fu, Au and Tai
     2011, Bilateral normal filtering for mesh denoising); then the vertices are moved to match the filtered normals
     (Sun, Rosin, Martin and Langbein 2007, Fast and effective feature-preserving mesh denoising, section 4).  Unlike
-    smoothing of positions this keeps sharp edges and the thickness of thin parts.
+    smoothing of positions, this keeps sharp edges and the thickness of thin parts.
     """
     vertices, corners, across = mesh.vertices.detach(), mesh.faces.long(), neighbor_faces(mesh.faces)
     a, b, c = (vertices.index_select(0, k) for k in corners.unbind(1))

@@ -13,7 +13,7 @@ from reli3d.geometry.grid import sample_grid
 
 
 def space_field(grids: Sequence[Tensor], points: Tensor) -> Tensor:
-    """Sum ``(N, C)`` at ``points (N, 3)`` of trilinear grids ``(n, n, n, C)`` over [-1, 1]^3 of rising resolution.
+    """Sum ``(N, C)``, at ``points (N, 3)``, of trilinear ``grids (n, n, n, C)`` over [-1, 1]^3, coarse to fine.
 
     An optimizer step on a coarse grid changes whole regions, so the coarse grids converge to the low frequencies.
     """
@@ -21,7 +21,7 @@ def space_field(grids: Sequence[Tensor], points: Tensor) -> Tensor:
 
 
 def light_field(maps: Sequence[Tensor], height: int) -> Tensor:
-    """Sum ``(height, 2 height, 3)`` of lat-long maps of rising resolution, bilinear and periodic in azimuth."""
+    """Sum ``(height, 2 height, 3)`` of lat-long maps, coarse to fine; bilinear and periodic in azimuth."""
     parts = []
     for values in maps:
         planes = values.permute(2, 0, 1)[None]
@@ -36,7 +36,7 @@ def light_field(maps: Sequence[Tensor], height: int) -> Tensor:
 
 
 def blurred_grid(grid: Tensor, cells: int) -> Tensor:
-    """``grid (X, Y, Z)`` averaged over blocks of ``cells`` a side and blended between their centers."""
+    """``grid (X, Y, Z)`` averaged over blocks of ``cells`` per side, interpolated between block centers."""
     if cells <= 1:
         return grid
     shape = grid.shape
@@ -58,7 +58,7 @@ class EvenAdam:
 
     @torch.no_grad()
     def step(self, gradient: Tensor, rate: float) -> None:
-        """Move the value by at most about ``rate`` against ``gradient``."""
+        """Moves the value against ``gradient`` by at most about ``rate``."""
         one, two = 0.9, 0.99
         self.count += 1
         self.mean.mul_(one).add_(gradient, alpha=1.0 - one)

@@ -47,7 +47,7 @@ class InputImages:
     """``V`` input images of one size on one device.
 
     color: ``(V, S, S, 3)`` linear.  mask: ``(V, S, S)`` coverage in [0, 1].  camera: batch of V cameras.  light_group:
-    for each view the index of its lighting, by default 0.  light_moves: the lighting is fixed to the camera.
+    index of the lighting per view, by default 0.  light_moves: whether the lighting is fixed to the camera.
     """
 
     color: Tensor
@@ -64,8 +64,8 @@ class InputImages:
     def of(cls, views: PosedImages, light: str | Sequence[Hashable] = "object") -> InputImages:
         """Converts sRGB images to linear.
 
-        light: ``object``, a lighting fixed to the object; ``camera``, one fixed to the camera; or for each view the
-        name of its lighting.  Raises TypeError or ValueError if shapes or devices do not match, or for another light.
+        light: ``object``, lighting fixed to the object; ``camera``, lighting fixed to the camera; or a lighting name
+        per view.  Raises TypeError or ValueError if shapes or devices do not match, or for an invalid ``light``.
         """
         images, masks = views.images, views.masks
         check("images", images, last=3)
@@ -96,16 +96,16 @@ class InputImages:
 
     @property
     def size(self) -> int:
-        """Pixels along a side."""
+        """Pixels per side."""
         return self.color.shape[1]
 
     def select(self, views: list[int]) -> InputImages:
-        """The images of these indices, in this order."""
+        """The images with these indices, in this order."""
         group = tuple(self.light_group[v] for v in views)
         return InputImages(self.color[views], self.mask[views], self.camera[views], group, self.light_moves)
 
     def resized(self, size: int) -> InputImages:
-        """The images resampled to ``size`` pixels a side; colors are averaged with the masks as weights."""
+        """The images resampled to ``size`` pixels per side; colors are averaged with the masks as weights."""
         if size == self.size:
             return self
         planes = torch.cat([self.color * self.mask[..., None], self.mask[..., None]], -1).permute(0, 3, 1, 2)
@@ -122,5 +122,5 @@ class InputImages:
         return replace(self, camera=replace(self.camera, c2w=c2w))
 
     def inside(self) -> Tensor:
-        """``(V, S, S)`` bool: pixels that, with their 8 neighbors, contain only the object."""
+        """``(V, S, S)`` bool: pixels that contain only the object, as do their 8 neighbors."""
         return max_pool2d(1.0 - self.mask[:, None], 3, 1, 1)[:, 0] < 1.0 - INSIDE_COVERAGE

@@ -1,4 +1,4 @@
-"""Lighting of the input images: a map fixed to the object, one fixed to the camera, or one for each group of views."""
+"""Lighting of the input images: a map fixed to the object, a map fixed to the camera, or a map per group of views."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from reli3d.render.points import SurfacePoints
 class Lights:
     """Environments of V views.
 
-    maps: ``(G, H, 2H, 3)`` radiance of G groups.  group: V indices of maps.  c2w: ``(V, 4, 4)`` if the maps are in the
-    axes of the cameras (+Y is the top of the image), None if they are in the object's frame.
+    maps: ``(G, H, 2H, 3)`` radiance of G groups.  group: map index of each of the V views.  c2w: ``(V, 4, 4)`` if the
+    maps are in camera axes (+Y is the top of the image); None if they are in the object's frame.
     """
 
     maps: Tensor
@@ -29,7 +29,7 @@ class Lights:
 
     @classmethod
     def of(cls, unknowns: Unknowns, start: Start, images: InputImages) -> Lights:
-        """The fitted lights of ``images``; gradients reach ``unknowns.light``."""
+        """The fitted lights of ``images``.  Gradients reach ``unknowns.light``."""
         maps = (start.light + light_maps(unknowns.light)).exp()
         return cls(maps, images.light_group, images.camera.c2w if images.light_moves else None)
 
@@ -43,7 +43,7 @@ class Lights:
         return Environment(light.lookup((world @ self.c2w[view, :3, :3]).contiguous()))
 
     def distinct(self) -> list[list[int]]:
-        """Views of equal lighting."""
+        """Groups of views with equal lighting."""
         if self.c2w is not None:
             return [[view] for view in range(len(self.group))]
         return [[v for v, g in enumerate(self.group) if g == k] for k in dict.fromkeys(self.group)]
@@ -59,7 +59,7 @@ class Lights:
         view: Tensor,
         radiance: Callable[[SurfacePoints, Tensor, Environment], Tensor],
     ) -> Tensor:
-        """``radiance(points, wo, environment)`` of each row under the lighting of its ``view (N,)``, ``(N, 3)``."""
+        """``radiance(points, wo, environment)``, ``(N, 3)``, each row under the lighting of its view ``view (N,)``."""
         views = self.distinct()
         if len(views) == 1:
             return radiance(points, wo, self.of_view(views[0][0]))

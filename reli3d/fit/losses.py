@@ -1,4 +1,4 @@
-"""Terms of the loss of a fit, one function each, and their weights, :class:`Weights`."""
+"""Loss terms of a fit, one function each, and their :class:`Weights`."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ class Weights:
     agreement: float = 0.3  # of :func:`agreement`
     shading: float = 30.0  # of :func:`display_error` while the surface is fitted
     curvature: float = 0.5  # of :func:`curvature`
-    sdf_change: float = 2e-3  # of the squared change of the signed distance, over the number of views
+    sdf_change: float = 2e-3  # of the squared change of the signed distance; divided by the number of views
     image: float = 1.0  # of :func:`display_error` in the fit of the maps and the lighting
     palette: float = 0.01  # of :func:`palette`
     hue: float = 0.1  # of :func:`hue_drift`
-    base_coarse: float = 0.02  # prior of the base color's coarse field towards the start, over the number of views
-    base_color: float = 20.0  # of :func:`near_base_color`, over the 4th power of the number of views with used colors
-    finish: float = 0.05  # prior of roughness and metallic towards the start, over the number of views
-    light: float = 2e-3  # prior of the lighting towards the start
+    base_coarse: float = 0.02  # pulls the base color's coarse field to the start; divided by the number of views
+    base_color: float = 20.0  # of :func:`near_base_color`; over the 4th power of the number of views with used colors
+    finish: float = 0.05  # pulls roughness and metallic to the start; divided by the number of views
+    light: float = 2e-3  # pulls the lighting to the start
     light_variation: float = 2e-3  # of :func:`total_variation` of the lighting
     exposure: float = 0.1  # of squared log exposures; their mean is ambiguous with the scale of the lighting
     demodulation: float = 0.3  # of :func:`shared_pattern`
-    free_bend: float = 2e-3  # of the squared bend of the normals while the material is fitted, times the views
-    bend: float = 20.0  # of the squared bend of the normals that is kept, over the square of the number of views
+    free_bend: float = 2e-3  # of the squared bend while the material is fitted; multiplied by the number of views
+    bend: float = 20.0  # of the squared bend that is kept; divided by the squared number of views
 
 
 def display_derivative(target: Tensor) -> Tensor:
@@ -72,9 +72,9 @@ def display_error(image: Tensor, other: Tensor, target: Tensor, bright: Tensor) 
 def agreement(color: Tensor, weight: Tensor) -> Tensor:
     """Photo-consistency: weighted variance of a point's color over the views, robust, mean over points.
 
-    color: ``(N, V, 3)`` display values where the point projects.  weight: ``(N, V)``, 0 where it is occluded.  Except
-    in highlights, a point on the true surface has the same color in all views.  The term needs neither light nor
-    material, so it is used before they are fitted.  Points that fewer than two views see do not count.
+    color: ``(N, V, 3)`` display values at the projections of each point.  weight: ``(N, V)``, 0 where it is occluded.
+    Except in highlights, a point on the true surface has the same color in all views.  The term needs neither lighting
+    nor material, so it is used before these are fitted.  Points visible in fewer than two views do not count.
     """
     total = weight.sum(1)
     valid = (weight > 0.0).sum(1) >= 2
@@ -87,7 +87,7 @@ def agreement(color: Tensor, weight: Tensor) -> Tensor:
 
 
 def outline(cover: Tensor, mask: Tensor) -> Tensor:
-    """Mean absolute difference of antialiased coverage and mask."""
+    """Mean absolute difference between antialiased coverage and mask."""
     return (cover - mask).abs().mean()
 
 
@@ -101,31 +101,31 @@ def curvature(sdf: Tensor, cell: float, weight: Tensor) -> Tensor:
 
 
 def total_variation(values: Tensor) -> Tensor:
-    """Total variation: mean absolute difference of neighbors of a map ``(H, W, C)`` that is periodic along W."""
+    """Total variation of a map ``(H, W, C)``, periodic along W: mean absolute difference of neighbors."""
     return values.diff(dim=0).abs().mean() + (values - values.roll(1, 1)).abs().mean()
 
 
 def near_start(grids: Sequence[Tensor]) -> Tensor:
-    """Sum over grids of the mean squared change; keeps parameters without data at the start."""
+    """Sum over grids of the mean squared change; keeps unconstrained parameters at their initial values."""
     return torch.stack([grid.square().mean() for grid in grids]).sum()
 
 
 def near_base_color(change: Tensor, weights: Weights, views: int) -> Tensor:
-    """Robust prior of the base color towards the start, mean over points; change: ``(N, 3)``, of its logits.
+    """Robust prior that pulls the base color to the start, mean over points; change: ``(N, 3)``, of the logits.
 
     Few views constrain normals and lighting poorly, and the residual shading would be baked into the base color as a
-    small change of most points.  A wrong base color of the start needs a large change; above ``BASE_COLOR_SCALE`` the
-    gradient decreases.  The weight is divided by ``views**4``: 0.25 at 3 views and 5e-4 at 14.
+    small change at most points.  Correcting a wrong initial color needs a large change, so the gradient decreases above
+    ``BASE_COLOR_SCALE``.  The weight is divided by ``views**4``: 0.25 at 3 views and 5e-4 at 14.
     """
     square = change.square().mean(1)
     return weights.base_color / views**4 * (square / (1.0 + square / (BASE_COLOR_SCALE * BASE_COLOR_SCALE))).mean()
 
 
 def palette(color: Tensor, tint: Tensor) -> Tensor:
-    """Sparsity of base colors: mean over random pairs of points of a robust distance of their colors.
+    """Sparsity of base colors: mean robust color distance over random pairs of points.
 
     color: ``(N, 3)`` logarithms of base color at points in random order, each paired with the next.  tint: ``(N, 3)``
-    linear color in the input images, of any scale; pairs of different chromaticity count less.  Variation within one
+    linear color in the input images, at any scale; pairs of different chromaticity count less.  Variation within one
     material is reduced, so that the lighting explains it; pairs that differ by much more than ``PALETTE_SCALE`` have
     almost no gradient (the global sparsity of reflectances of Barron and Malik 2015, Shape, Illumination, and
     Reflectance from Shading, section 4.1.2, on pairs).
@@ -141,15 +141,16 @@ def hue_drift(color: Tensor, start: Tensor) -> Tensor:
     """Squared change of the object's mean chromaticity, in log base color.
 
     color, start: ``(N, 3)`` logarithms of base color at the same points.  A factor per channel is ambiguous between
-    base color and lighting: a red object under white light looks like a white one under red light.  The start, a
-    prediction from learned priors, resolves it.  The brightness is not constrained, as that of a start is often wrong.
+    base color and lighting: a red object under white light looks like a white one under red light.  The start,
+    predicted from learned priors, resolves this ambiguity.  Brightness is not constrained, because the start's is often
+    wrong.
     """
     drift = (color - start).mean(0)
     return (drift - drift.mean()).square().mean()
 
 
 def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
-    """Priors of material, light and exposures towards the start; those of the material are divided by ``views``."""
+    """Priors that pull material, lighting and exposures to the start; the material's are divided by ``views``."""
     base, finish = ([grid[..., part] for grid in unknowns.material] for part in (slice(0, 3), slice(3, 5)))
     loss = weights.base_coarse / views * near_start(base) + weights.finish / views * near_start(finish)
     loss = loss + weights.light * near_start(unknowns.light)

@@ -1,4 +1,4 @@
-"""Fits light and material on a fixed surface: primary rays are traced once, random pixels are shaded at every step."""
+"""Fits lighting and material on a fixed surface: primary rays are traced once, random pixels shaded at every step."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MATERIAL_UNTIL = 0.7  # progress at which the material is frozen, and the bend i
 class FixedSurface:
     """Constants of a fit of maps and lighting.
 
-    asset: the surface with the start's maps.  received: ``(vertices, 3)``, of :func:`~reli3d.fit.bounce.gathered`.
+    asset: the surface with the start's maps.  received: ``(vertices, 3)``, from :func:`~reli3d.fit.bounce.gathered`.
     used: indices of the views whose colors are used.
     """
 
@@ -57,7 +57,7 @@ class MapsStage:
 
 @dataclass(frozen=True)
 class Pixels:
-    """Pixels inside the object's masks and the surface points that they show; N rows."""
+    """Pixels inside the masks and the surface points visible there; N rows."""
 
     view: Tensor
     position: Tensor
@@ -73,9 +73,9 @@ class Pixels:
 
 @torch.no_grad()
 def traced(data: FixedSurface, scene: RayScene, seed: int) -> Pixels:
-    """The pixels of the used views that lie inside the masks by a pixel and whose rays hit the surface.
+    """The pixels of the used views that are at least one pixel inside the masks and whose rays hit the surface.
 
-    scene: of the surface.  seed: of the order.
+    scene: rays against the surface.  seed: of the random order.
     """
     asset, images = data.asset, data.images
     inside, mesh, parts = images.inside(), asset.mesh, []
@@ -114,10 +114,11 @@ def traced(data: FixedSurface, scene: RayScene, seed: int) -> Pixels:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate of the shading in one step.
+    """Parameters of the shading estimate in one step.
 
-    scene: casts shadows, None for none.  samples: of light, BSDF and cosine.  seed: of the random numbers.
-    independent: two independent estimates, so that the gradient is unbiased; with False it is that of the loss's value.
+    scene: occluders; None: no shadows.  samples: counts of light, BSDF and cosine samples.  seed: of the random
+    numbers.  independent: use two independent estimates, for an unbiased gradient; False: the gradient of the returned
+    loss.
     """
 
     scene: RayScene | None
@@ -129,7 +130,7 @@ class Estimate:
 def maps_loss(
     unknowns: Unknowns, data: FixedSurface, pixels: Pixels, rows: Tensor, weights: losses.Weights, estimate: Estimate
 ) -> Tensor:
-    """Loss of one step over ``rows`` of the pixels, with gradients to material, detail, bend, light and exposure."""
+    """Loss of one step over ``rows`` of the pixels; gradients reach material, detail, bend, light and exposure."""
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
     detail = sample_texture(unknowns.detail, pixels.uv[rows])
     change = material_change(unknowns, position)
@@ -164,8 +165,10 @@ def maps_loss(
 
 
 def fading(progress: float, settled: bool) -> float:
-    """Factor of the learning rate: falls linearly from 1 to 0.1 after progress 0.6, or, once the material is frozen
-    (``settled``), after ``MATERIAL_UNTIL``."""
+    """Learning-rate factor, which falls linearly from 1 to 0.1.
+
+    The decay begins at progress 0.6 or, once the material is frozen (``settled``), at ``MATERIAL_UNTIL``.
+    """
     since = (progress - MATERIAL_UNTIL) / (1.0 - MATERIAL_UNTIL) if settled else (progress - 0.6) / 0.4
     return 1.0 - 0.9 * min(max(since, 0.0), 1.0)
 
@@ -173,11 +176,11 @@ def fading(progress: float, settled: bool) -> float:
 def fit_maps(
     unknowns: Unknowns, data: FixedSurface, weights: losses.Weights, budget: Budget, stage: MapsStage, *, seed: int
 ) -> None:
-    """Fit light, exposures and material on a fixed surface, coarse to fine.
+    """Fits lighting, exposures and material on a fixed surface, coarse to fine.
 
-    Errors of normals, shadows and interreflection would be baked into the base color.  While the material is fitted,
-    a weakly regularized bend of the shading normals absorbs them.  Then the material is frozen and the bend is reset
-    and fitted again with a stronger prior; only this bend is kept.
+    Errors of normals, shadows and interreflection would be baked into the base color.  While the material is fitted, a
+    weakly regularized bend of the shading normals absorbs these errors.  Then the material is frozen, and the bend is
+    reset and fitted again with a stronger prior; only this second bend is kept.
     """
     scene = RayScene(data.asset.mesh.vertices, data.asset.mesh.faces)
     pixels = traced(data, scene, seed)

@@ -35,10 +35,10 @@ class Refinement:
     """Result of :func:`refine`.
 
     asset: the refined asset, or the start if no blend of fit and start is at least as good.  parts: the blend weights.
-    before, after: mean PSNR [dB] on white over the input views that were used and over the held-out ones (NaN without
-    any), of renderings with direct light and one-bounce interreflection (:func:`~reli3d.fit.bounce.gathered`).
-    held: indices of the held-out views.  c2w: ``(V, 4, 4)``, the corrected cameras.  notes: one line each.  curve: the
-    losses of the run, as in :class:`~reli3d.fit.budget.Budget`.  steps: steps of each stage.
+    before, after: mean PSNR [dB] over the fitted views and over the held-out views (NaN if there are none), of
+    renderings on white with direct light and one-bounce interreflection (:func:`~reli3d.fit.bounce.gathered`).  held:
+    indices of the held-out views.  c2w: ``(V, 4, 4)``, the corrected cameras.  notes: one line each.  curve: loss
+    curve, as in :class:`~reli3d.fit.budget.Budget`.  steps: number of steps per stage.
     """
 
     asset: Asset
@@ -73,7 +73,7 @@ class Refinement:
 
 
 def held_out(count: int) -> tuple[int, ...]:
-    """Indices of the held-out views: none of fewer than three, one of fewer than twelve, else two."""
+    """Indices of the held-out views: none of fewer than 3 views, one of fewer than 12, otherwise two."""
     return () if count < 3 else (count // 2,) if count < 12 else (count // 3, 2 * count // 3)
 
 
@@ -96,18 +96,18 @@ def refine(
 ) -> Refinement:
     """Fits surface, material and lighting of ``asset`` to posed images by inverse rendering.
 
-    views: images, masks and cameras in the frame of ``asset``.  seconds, steps: the budget, one of the two; with
-    ``steps`` the result is deterministic on one machine.  resolution: cells of the surface's grid along the longest
-    side, more for thin objects (:func:`~reli3d.fit.shape.start_grid`).  weights: of the loss terms.  cameras: optimize
-    the camera poses as well.  light: ``object``, lighting fixed to the object; ``camera``, lighting that moves with the
-    camera, as that of a turntable or a flash; or for each view the name of its lighting.  The environment of the
-    result is then the lighting of view 0.  seed: of all random numbers.  bar: show progress on stderr.  interrupt:
-    called before every step; once it returns True the fit ends with the best result so far.
+    views: images, masks and cameras in the frame of ``asset``.  seconds, steps: the budget, exactly one of the two;
+    with ``steps`` the result is deterministic on one machine.  resolution: grid cells along the longest side, raised
+    automatically for thin objects (:func:`~reli3d.fit.shape.start_grid`).  weights: of the loss terms.  cameras:
+    optimize the camera poses as well.  light: ``object``, lighting fixed to the object; ``camera``, lighting that moves
+    with the camera (a turntable or a flash); or a lighting name per view.  For the last two, the result's environment
+    is that of view 0.  seed: of all random numbers.  bar: show progress on stderr.  interrupt: called before every
+    step; once it returns True the fit ends with the best result so far.
 
     With three or more views some are held out (:func:`held_out`): their masks are used, their colors only to select
     which parts of the fit are kept (:func:`~reli3d.fit.choice.chosen`).  The inputs are detached: no gradient reaches
     them, and the result has none.  Raises TypeError or ValueError if asset and views have different devices, if shapes
-    do not match, for another ``light``, for a budget that is not one positive number, or if the asset lacks an
+    do not match, for an invalid ``light``, for a budget that is not one positive number, or if the asset lacks an
     environment, an atlas or faces.
     """
     images, weights = InputImages.of(views, light), weights or losses.Weights()

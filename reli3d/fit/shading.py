@@ -21,7 +21,6 @@ def radiance(
     scene: RayScene | None,
     seed: int,
 ) -> Tensor:
-    """Linear radiance ``(N, 3)`` from ``points`` towards ``wo (N, 3)``: direct light, with shadows if ``scene`` is
-    given."""
+    """Linear radiance ``(N, 3)`` from ``points`` towards ``wo (N, 3)`` by direct light.  scene: None: no shadows."""
     options = ShadeOptions(samples=samples, seed=seed, diffuse_model=DIFFUSE_MODEL)
     return shade(points, wo, light, scene=scene, options=options)

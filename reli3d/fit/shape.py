@@ -1,4 +1,4 @@
-"""Fits the surface: a signed distance grid, extracted at every step, by silhouettes, photo-consistency and shading."""
+"""Fits the surface, a signed distance grid extracted at every step, to silhouettes, photo-consistency and shading."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ class Grid:
 
     @classmethod
     def around(cls, vertices: Tensor, resolution: int) -> Grid:
-        """About ``resolution`` cells along the longest side of the origin-centered bounding box of ``vertices``."""
+        """Grid around ``vertices``, centered at the origin, with about ``resolution`` cells along the longest side."""
         reach = vertices.abs().amax(0)
         cell = 2.0 * float(reach.max()) / resolution
         return cls(tuple(2 * (math.ceil(r / cell) + MARGIN_CELLS) + 1 for r in reach.tolist()), cell)
 
     @property
     def radius(self) -> tuple[float, ...]:
-        """Half extents."""
+        """Half extents of the grid."""
         return tuple(0.5 * self.cell * (n - 1) for n in self.shape)
 
     def points(self, device) -> Tensor:
@@ -75,7 +75,7 @@ class Grid:
 
 @torch.no_grad()
 def start_sdf(mesh: Mesh, grid: Grid) -> Tensor:
-    """Signed distance of a closed mesh at the points of ``grid``: exact within ``BAND_CELLS``, interpolated beyond."""
+    """Signed distance to a closed mesh at the points of ``grid``: exact within ``BAND_CELLS``, interpolated beyond."""
     at = grid.points(mesh.vertices.device)
     few = tuple(max(2, (n - 1) // COARSE_RATIO + 1) for n in grid.shape)
     axes = [torch.linspace(-r, r, n, device=at.device, dtype=torch.float32) for r, n in zip(grid.radius, few)]
@@ -92,7 +92,7 @@ def start_sdf(mesh: Mesh, grid: Grid) -> Tensor:
 
 @torch.no_grad()
 def hull_sdf(images: InputImages, grid: Grid) -> Tensor:
-    """Signed distance of the visual hull of all masks, a lower bound of the surface's."""
+    """Signed distance to the visual hull of all masks, a lower bound on the signed distance to the surface."""
     at = grid.points(images.mask.device).reshape(-1, 3)
     inside = hull_distance(at, mask_distance(images.mask), images.camera)
     return -inside.reshape(grid.shape)
@@ -102,10 +102,10 @@ def hull_sdf(images: InputImages, grid: Grid) -> Tensor:
 def curvature_weight(sdf: Tensor, bound: Tensor, cell: float) -> Tensor:
     """Weights ``(X, Y, Z)`` of :func:`losses.curvature` at the points of the grid.
 
-    1 near parts at least ``2 CORE_DEPTH_CELLS`` thick, ``THIN_WEIGHT`` near thinner ones, 0 beyond ``BAND_CELLS`` from
-    the surface.  The signed distance of a thin part has its medial axis, where its curvature is large, inside the band,
-    so with full weight the term would remove the part.  Points deeper than ``CORE_DEPTH_CELLS`` are the core of thick
-    parts; points of the band that no core reaches are thin.
+    1 near parts at least ``2 CORE_DEPTH_CELLS`` thick, ``THIN_WEIGHT`` near thinner parts, 0 beyond ``BAND_CELLS`` from
+    the surface.  The medial axis of a thin part, where the curvature of the signed distance is large, lies inside the
+    band, so with full weight the term would remove the part.  Points deeper than ``CORE_DEPTH_CELLS`` form the core of
+    thick parts; band points that no core reaches count as thin.
     """
     core = (torch.maximum(sdf, bound) < -CORE_DEPTH_CELLS * cell).to(sdf)[None, None]
     reach = round(CORE_DEPTH_CELLS + BAND_CELLS) + 1
@@ -117,10 +117,10 @@ def curvature_weight(sdf: Tensor, bound: Tensor, cell: float) -> Tensor:
 
 
 def start_grid(mesh: Mesh, images: InputImages, resolution: int) -> tuple[Grid, Tensor, Tensor]:
-    """A grid for a closed mesh, with the signed distances of the mesh and of the masks' visual hull.
+    """A grid for a closed mesh, with the signed distances to the mesh and to the masks' visual hull.
 
-    About ``resolution`` cells along the longest side; up to ``MAX_REFINEMENT`` times as many, within about
-    ``MAX_GRID_POINTS``, if much of the surface is thin: a sheet of two cells loses its holes and rims.
+    About ``resolution`` cells along the longest side.  If much of the surface is thin, up to ``MAX_REFINEMENT`` times
+    as many, within about ``MAX_GRID_POINTS``, because a sheet two cells thick loses its holes and rims.
     """
     grid = Grid.around(mesh.vertices, resolution)
     sdf, bound = start_sdf(mesh, grid), hull_sdf(images, grid)
@@ -192,10 +192,10 @@ def shape_loss(
     seed: int,
     independent: bool = True,
 ) -> Tensor:
-    """Loss of one step over the surface, with gradients to every part of ``unknowns`` but the detail.
+    """Loss of one step of the surface fit; gradients reach every part of ``unknowns`` except ``detail``.
 
     progress: of the fit, in [0, 1].  seed: of the step's points, views and light samples.  independent: use two
-    independent estimates of the shading; with False the gradient is that of the returned value, for tests.
+    independent shading estimates, for an unbiased gradient; False, for tests: the gradient of the returned loss.
     """
     rng = torch.Generator().manual_seed(seed)
     mesh = extracted(unknowns.sdf, data.bound, data.grid)
@@ -275,8 +275,10 @@ def fit_shape(
     seed: int,
     cameras: bool,
 ) -> None:
-    """Optimizes ``unknowns.sdf`` with material, light and exposures, and poses if ``cameras``, up to the fraction
-    ``until`` of the budget."""
+    """Optimizes ``unknowns.sdf`` jointly with material, lighting and exposures.
+
+    until: fraction of the budget used at the end.  cameras: also optimize the poses.
+    """
     surface = EvenAdam(unknowns.sdf)
     rates = {"material": 0.03, "light": 0.02, "exposure": 0.01, **({"pose": 2e-4} if cameras else {})}
     changed = {name: unknowns.groups()[name] for name in rates}

@@ -24,8 +24,10 @@ MAX_SURFACE_DISTANCE = 0.08  # of the surfaces along the new one's normal, in th
 
 
 def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Face ``(N,)`` and barycentrics ``(N, 2)`` of ``mesh`` that correspond to points of another surface: the first hit
-    from outside along the normal within ``MAX_SURFACE_DISTANCE``, else the nearest vertex."""
+    """Face ``(N,)`` and barycentrics ``(N, 2)`` of the points on ``mesh`` that correspond to points on another surface.
+
+    The first hit from outside along the normal within ``MAX_SURFACE_DISTANCE``, otherwise the nearest vertex.
+    """
     scene = RayScene(mesh.vertices, mesh.faces)
     hits = scene.closest(position + MAX_SURFACE_DISTANCE * normal, -normal, t_max=2.0 * MAX_SURFACE_DISTANCE)
     face, bary = hits.face.clone(), hits.bary.clone()
@@ -42,7 +44,7 @@ def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, 
 
 
 def transfer_textures(mesh: Mesh, source: Asset, size: int) -> Asset:
-    """``mesh`` with a new atlas of ``size`` texels, and the lighting and maps of ``source`` at corresponding points."""
+    """``mesh`` with a new atlas of ``size`` texels per side, and the lighting and maps of ``source``."""
     mesh = unwrap(mesh, texture_size=size)
     mesh = replace(mesh.with_tangents(), colors=None)  # vertex colors are baked into the maps below
     texels = rasterize_texels(mesh, size)

@@ -37,10 +37,9 @@ class Unknowns:
     """Variables of the optimization, in a frame in which the object fills the box [-1, 1]^3.
 
     sdf: ``(X, Y, Z)`` signed distance, negative inside.  material: grids ``(n, n, n, 5)`` over the box, changes of
-    logits.  detail: ``(T, T, 3)`` over the atlas, changes of the base color's logits.  bend: grids ``(n, n, n, 3)``
-    over the box, added to the unit shading normal.  light: maps ``(G, h, 2h, 3)`` of G lightings, changes of log
-    radiance.  exposure: ``(V,)`` logarithms.  pose: ``(V, 6)``, a rotation vector [rad] and a translation in the
-    camera's axes.
+    logits.  detail: ``(T, T, 3)`` over the atlas, changes of base color logits.  bend: grids ``(n, n, n, 3)`` over the
+    box, added to the unit shading normal.  light: maps ``(G, h, 2h, 3)`` of G lightings, changes of log radiance.
+    exposure: ``(V,)`` logarithms.  pose: ``(V, 6)``, a rotation vector [rad] and a translation in the camera's axes.
     """
 
     sdf: Tensor
@@ -127,8 +126,8 @@ def material_change(unknowns: Unknowns, position: Tensor) -> Tensor:
 def bent(unknowns: Unknowns, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     """Unit shading normals ``(N, 3)``, ``normal`` plus the bend at ``position``, and the bend ``(N, 3)``.
 
-    The bend is shorter than ``MAX_BEND``: a normal turned away from the incident light would explain a black base
-    color.
+    The bend is limited to ``MAX_BEND``: otherwise a normal turned away from the incident light could explain a black
+    base color.
     """
     bend = space_field(unknowns.bend, position)
     bend = bend / (1.0 + (bend.square().sum(1, keepdim=True) / MAX_BEND**2)).sqrt()
@@ -141,9 +140,9 @@ def light_maps(light: list[Tensor]) -> Tensor:
 
 
 def corrected(camera: Camera, pose: Tensor) -> Camera:
-    """``camera`` rotated and translated by ``pose (..., 6)`` in its own axes.  Gradient with respect to ``pose``.
+    """``camera`` rotated and translated by ``pose (..., 6)`` in camera axes.  Gradients reach ``pose``.
 
-    The rotation is the Cayley map of its vector, which equals the exponential map to second order.
+    The rotation is the Cayley map of the rotation vector, which equals the exponential map to second order.
     """
     half, eye = 0.5 * pose[..., :3], torch.eye(3, device=pose.device, dtype=torch.float32)
     x, y, z = half.unbind(-1)
@@ -157,8 +156,7 @@ def corrected(camera: Camera, pose: Tensor) -> Camera:
 
 
 def filled_grid(position: Tensor, values: Tensor, n: int) -> Tensor:
-    """Grid ``(n, n, n, C)`` over [-1, 1]^3 of the means of the ``values (N, C)`` nearest to each point, with gaps
-    filled.
+    """Grid ``(n, n, n, C)`` over [-1, 1]^3: at each point, the mean of the ``values (N, C)`` nearest to it.
 
     Gaps are filled by pull-push over a mip pyramid (Grossman and Dally 1998, Point Sample Rendering).
     """
@@ -180,5 +178,5 @@ def _pushed(total: Tensor) -> Tensor:
 
 
 def unit(value: Tensor) -> Tensor:
-    """``value (..., 3)`` at length 1."""
+    """``value (..., 3)`` normalized to length 1."""
     return normalize(value, dim=-1)

@@ -20,7 +20,7 @@ FULL_WEIGHT_COSINE = 0.2  # between normal and direction to the eye, from which 
 def view_colors(display: Tensor, position: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Samples colors ``(N, V, 3)`` and coverage ``(N, V)`` of the images at the projections of ``position (N, 3)``.
 
-    display: ``(V, 4, S, S)``, of :func:`display_planes`.  camera: batch of V.  Bilinear.  Gradients with respect to
+    display: ``(V, 4, S, S)``, from :func:`display_planes`.  camera: batch of V.  Bilinear.  Gradients reach
     ``position`` and the cameras.
     """
     pixels, _ = project(position[None], camera.c2w[:, None], camera.intrinsics[:, None])
@@ -38,10 +38,10 @@ def display_planes(images: InputImages) -> Tensor:
 
 @torch.no_grad()
 def view_weights(scene: RayScene, position: Tensor, normal: Tensor, camera: Camera) -> Tensor:
-    """Weights ``(N, V)`` in [0, 1] of the cameras: visibility times the cosine of the viewing angle, which is clamped
-    at ``FULL_WEIGHT_COSINE`` and divided by it.
+    """View weights ``(N, V)`` in [0, 1]: visibility times the cosine of the viewing angle over ``FULL_WEIGHT_COSINE``.
 
-    No gradient: otherwise the loss could be reduced by turning the surface away from the cameras.
+    The quotient is clamped to [0, 1].  No gradient: otherwise the loss could be reduced by turning the surface away
+    from the cameras.
     """
     visible = visible_from(scene, position, normal, camera)
     to_eye = unit(camera.c2w[None, :, :3, 3] - position[:, None])

@@ -1,7 +1,7 @@
-"""Baking: a function of surface points, evaluated at the texels of an atlas; every texel is filled.
+"""Baking: evaluates a function of surface points at the texels of an atlas, and fills all other texels.
 
 Maps are ``(T, T, C)``; row 0 is v = 0 (glTF: v down).  Texel (row, column) is sampled at its center ((column + 0.5) /
-T, (row + 0.5) / T).  Nothing here has a gradient.
+T, (row + 0.5) / T).  No gradients.
 """
 
 from __future__ import annotations
@@ -89,9 +89,9 @@ def _border_segments(faces: Tensor) -> Tensor:
 def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     """Face and barycentrics of every texel of a ``size`` x ``size`` map over the UV of ``mesh``.
 
-    A texel whose center lies in a face takes that face, the first of several.  A texel whose center is within 1.5
-    texels of a chart takes the nearest point of the chart's border, so that bilinear lookups on the surface read only
-    texels of the surface.  Bitwise identical for any number of threads.  Peak memory: 24 bytes per texel.  Raises
+    A texel whose center lies in a face takes that face (the first, if several overlap).  A texel whose center is within
+    1.5 texels of a chart takes the nearest point on the chart's border, so that bilinear lookups on the surface read
+    only texels of that surface.  Bitwise identical for any number of threads.  Peak memory: 24 bytes per texel.  Raises
     ValueError without UV.
     """
     corners = _corners(mesh, size)
@@ -120,7 +120,7 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
 
 
 def coverage(mesh: Mesh, size: int) -> Tensor:
-    """Number of faces whose interior holds each texel center, ``(size, size)`` uint8, 255 at most."""
+    """Number of faces whose interior contains each texel center, ``(size, size)`` uint8, at most 255."""
     corners = _corners(mesh, size)
     hits = torch.zeros(size, size, dtype=torch.uint8, device=corners.device)
     if len(mesh.faces):
@@ -138,12 +138,12 @@ def coverage(mesh: Mesh, size: int) -> Tensor:
 
 
 def interpolate(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions and unit normals ``(N, 3)`` of the texels with the flat indices ``index`` (N,) int64, all valid."""
+    """Positions and unit normals ``(N, 3)`` at the valid texels with flat int64 indices ``index (N,)``."""
     return _positions_normals(mesh, _checked_places(mesh, texels, index), index)
 
 
 def interpolate_tangents(mesh: Mesh, texels: Texels, index: Tensor) -> Tensor:
-    """Unit tangents with sign, ``(N, 4)``, of the texels with the flat indices ``index`` (N,) int64, all valid."""
+    """Unit tangents with sign, ``(N, 4)``, at the valid texels with flat int64 indices ``index (N,)``."""
     return _tangents(mesh, _checked_places(mesh, texels, index), index)
 
 
@@ -202,16 +202,16 @@ def bake(
 ) -> dict[str, Tensor]:
     """Evaluates ``fn`` at the texels of an atlas; returns maps ``{name: (size, size, C)}`` float32.
 
-    mesh: with ``uv``, of which the part in [0, 1] is baked.  size: texels per side, 1 to 16384; row 0 is v = 0.  fn:
-    called as ``fn(position (N, 3), normal (N, 3))`` with at most ``chunk`` surface points at a time, under
-    ``torch.no_grad``; returns ``{name: (N, C)}``, or one tensor, which is named "value".  Results are stored
-    unchanged, in any range; :class:`~reli3d.render.asset.TextureSet` expects [0, 1].  texels: from
-    :func:`~reli3d.geometry.bake.rasterize_texels`, for reuse.  tangents: pass the tangents ``(N, 4)`` as third
-    argument.  values: vertex attributes ``(V, C)``, interpolated and passed as last argument.  fill: extend the results
-    to all other texels from the nearest valid one; otherwise they are 0.
+    mesh: with ``uv``; only the part in [0, 1] is baked.  size: texels per side, 1 to 16384; row 0 is v = 0.  fn: called
+    as ``fn(position (N, 3), normal (N, 3))`` with at most ``chunk`` surface points at a time, under ``torch.no_grad``;
+    returns ``{name: (N, C)}``, or one tensor, which is named "value".  Results are stored unchanged, in any range;
+    :class:`~reli3d.render.asset.TextureSet` expects [0, 1].  texels: from
+    :func:`~reli3d.geometry.bake.rasterize_texels`, for reuse.  tangents: also pass tangents ``(N, 4)`` as the third
+    argument.  values: vertex attributes ``(V, C)``, interpolated and passed as the last argument.  fill: fill all other
+    texels from the nearest valid texel; if False, they are 0.
 
     No gradient.  Raises TypeError for a wrong type or dtype; ValueError without ``uv``, if the surface covers no texel,
-    or if ``fn`` returns other shapes or names for different chunks.
+    or if ``fn`` returns a wrong shape or a varying number of channels.
 
     >>> maps = reli3d.bake(mesh, 64, lambda position, normal: 0.5 + 0.5 * normal)
     >>> textures = reli3d.TextureSet(maps["value"], roughness=0.5, metallic=0.0)
@@ -253,9 +253,9 @@ def bake(
 
 
 def nearest_valid(valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Flat index (int32) and squared distance [texels] of the nearest valid texel, both ``(H, W)``; exact.
+    """Flat index (int32) of the nearest valid texel and squared distance [texels^2] to it, both ``(H, W)``; exact.
 
-    Without a valid texel the index is -1, the distance inf.  Equal distances: the upper row, then the left column.
+    Without a valid texel, the index is -1 and the distance inf.  Ties go to the upper row, then the left column.
     """
     check("valid", valid, shape=("H", "W"), dtype=torch.bool)
     (h, w), device = valid.shape, valid.device
@@ -288,11 +288,11 @@ def dilate(maps: Mapping[str, Tensor], valid: Tensor, *, iterations: int | None 
 def dilate(
     maps: Mapping[str, Tensor] | Tensor, valid: Tensor, *, iterations: int | None = None
 ) -> dict[str, Tensor] | Tensor:
-    """Maps in which every texel that is not ``valid`` takes the value of the nearest valid one.
+    """Fills every texel of ``maps`` that is not ``valid`` with the value of the nearest valid texel.
 
-    maps: ``(H, W, C)`` float32, or a dictionary of them; they are not changed.  valid: ``(H, W)`` bool.  iterations:
-    fill up to this distance [texels] only; None fills everything, so that every mip level holds written texels only.
-    Of equal distances the upper row comes first, then the left column.
+    maps: ``(H, W, C)`` float32, or a dictionary of such maps; not modified.  valid: ``(H, W)`` bool.  iterations: fill
+    only up to this distance [texels]; None fills all texels, so that no mip level contains an unwritten texel.  Ties go
+    to the upper row, then the left column.
     """
     if iterations is not None and iterations < 0:
         raise ValueError(f"iterations: expected None or at least 0, got {iterations}")

@@ -106,9 +106,9 @@ class Camera:
 
 
 def check_camera(camera: Camera, *, like: Tensor, views: int | None = None, size: Sequence[int] | None = None) -> None:
-    """Raise TypeError or ValueError unless ``camera`` has one batch axis, of ``views``, on the device of ``like``.
+    """Raises TypeError or ValueError unless ``camera`` is a batch of ``views`` cameras on the device of ``like``.
 
-    size: height and width of its images, where they matter.
+    views: None: any number.  size: expected height and width in pixels; None: any.
     """
     expect("camera", camera, Camera)
     check("camera", camera.c2w, like=like)
@@ -120,7 +120,7 @@ def check_camera(camera: Camera, *, like: Tensor, views: int | None = None, size
 
 
 def image_plane(camera: Camera) -> tuple[Tensor, Tensor]:
-    """Right and up, both ``(..., H, W)``, of all pixel centers in the plane at distance 1 before the camera."""
+    """Right and up coordinates, both ``(..., H, W)``, of all pixel centers, in the plane at depth 1."""
     fx, fy, cx, cy = (v[..., None, None] for v in camera.intrinsics.unbind(-1))
     ys = torch.arange(camera.height, dtype=torch.float32, device=camera.c2w.device)[:, None] + 0.5
     xs = torch.arange(camera.width, dtype=torch.float32, device=camera.c2w.device)[None, :] + 0.5
@@ -132,9 +132,9 @@ def image_plane(camera: Camera) -> tuple[Tensor, Tensor]:
 def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
     """Rays through all pixel centers: origins and unit directions, both ``(..., H, W, 3)`` float32, world frame.
 
-    Row 0 is the top row of the image.  Origins are the camera position, expanded without a copy.  Hits of unit
-    directions have ``t`` as Euclidean distance, not depth along the viewing axis.  Gradients reach ``c2w`` and
-    ``intrinsics``.
+    Row 0 is the top row of the image.  Origins are the camera position, expanded without a copy.  Because directions
+    are unit, ``t`` of a hit is the Euclidean distance, not the depth along the viewing axis.  Gradients reach ``c2w``
+    and ``intrinsics``.
 
     >>> origins, directions = reli3d.camera_rays(camera)  # (H, W, 3) each
     >>> hits = reli3d.RayScene(mesh).intersect(origins, directions)
@@ -151,8 +151,8 @@ def project(points: Tensor, c2w: Tensor, intrinsics: Tensor) -> tuple[Tensor, Te
     """Pixel coordinates ``(..., 2)`` and depth along the viewing axis ``(...)`` of world points.
 
     points: ``(..., 3)``; c2w: ``(..., 4, 4)``, a rotation and a translation; intrinsics: ``(..., 4)``.  Batch axes
-    broadcast (put ``c2w[:, None]`` against ``points (N, 3)`` for all pairs).  A point behind the camera has depth
-    < 0 and its pixel is the mirrored one; depth 0 gives inf.  Gradients reach all three.
+    broadcast (use ``c2w[:, None]`` with ``points (N, 3)`` for all pairs).  A point behind the camera has depth < 0 and
+    mirrored pixel coordinates; depth 0 gives inf.  Gradients reach all three.
     """
     check("points", points, last=3)
     check("c2w", c2w, last=4, like=points)
@@ -165,10 +165,10 @@ def project(points: Tensor, c2w: Tensor, intrinsics: Tensor) -> tuple[Tensor, Te
 
 
 def box_of(points: Tensor, camera: Camera) -> tuple[int, int, int, int]:
-    """Pixel box ``(x0, y0, x1, y1)``, ends exclusive, that contains the projection of the convex hull of ``points (N,
-    3)`` in one camera, clipped to the image; the whole image if a point is near or behind the camera's plane.
+    """Pixel box ``(x0, y0, x1, y1)``, ends exclusive, around the projection of the convex hull of ``points (N, 3)``.
 
-    At least one pixel, even if all points project outside the image.  No gradient.
+    camera: a single camera.  The box is clipped to the image; it has at least one pixel, even if all points project
+    outside the image, and is the whole image if a point is near or behind the camera plane.  No gradient.
     """
     points, eye = points.detach(), camera.position.detach()
     pixels, depth = project(points, camera.c2w.detach(), camera.intrinsics.detach())
@@ -193,9 +193,9 @@ def look_at(
 ) -> Tensor:
     """Camera-to-world matrix ``(..., 4, 4)`` of a camera at ``eye`` that looks at ``target``, with ``up`` upwards.
 
-    eye, target, up: ``(..., 3)`` float32 tensors or lists of numbers; batch axes broadcast.  Lists go to the device of
-    the first tensor.  Gradients reach all three.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or
-    if ``up`` is parallel to the viewing direction.
+    eye, target, up: ``(..., 3)`` float32 tensors or lists of numbers; batch axes broadcast.  Lists are moved to the
+    device of the first tensor.  Gradients reach all three.  Raises TypeError for a wrong dtype, ValueError for a wrong
+    shape or if ``up`` is parallel to the viewing direction.
 
     >>> pose = reli3d.look_at([0.0, 0.5, 3.0], [0.0, 0.0, 0.0])
     >>> camera = reli3d.Camera.from_fov(pose, 0.7, 64, 48)

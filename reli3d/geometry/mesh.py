@@ -1,7 +1,7 @@
 """Triangle meshes: the mesh type, normals, components and the topology report.
 
-Faces are counter-clockwise seen from outside.  Topology (components, report) is that of the *welded* mesh, in which
-vertices at bit-identical positions are one: atlases and exporters split vertices where the surface is whole.
+Faces are counter-clockwise seen from outside.  Topology (components, report) refers to the *welded* mesh, in which
+vertices at bit-identical positions are merged, because atlases and exporters split the vertices of a connected surface.
 """
 
 from __future__ import annotations
@@ -78,19 +78,19 @@ class Mesh:
 
 @dataclass(frozen=True)
 class MeshReport:
-    """Result of :func:`report`.  Counts are of the welded mesh, except ``vertices`` and ``faces``: as stored."""
+    """Result of :func:`report`.  Counts refer to the welded mesh; ``vertices`` and ``faces`` are as stored."""
 
     vertices: int
     faces: int
-    degenerate_faces: int  # with two corners at one position; left out of every other count
-    welded_vertices: int = 0  # different positions that a face uses
+    degenerate_faces: int  # with two corners at one position; excluded from every other count
+    welded_vertices: int = 0  # distinct positions used by a face
     components: int = 0  # connected through shared vertices
     euler: int = 0  # welded vertices - edges + faces
     boundary_edges: int = 0  # with one face
     nonmanifold_edges: int = 0  # with three or more faces
-    flipped_edges: int = 0  # with two faces that run through it in the same direction
+    flipped_edges: int = 0  # with two faces that traverse it in the same direction
     nonmanifold_vertices: int = 0  # whose faces form several fans
-    watertight: bool = False  # faces present, every edge has two or more faces, an even number
+    watertight: bool = False  # has faces, and every edge has an even number of faces
     manifold: bool = True  # no non-manifold edge or vertex and no flipped edge; a border is allowed
 
 
@@ -104,7 +104,7 @@ def _check_topology(vertices: Tensor, faces: Tensor) -> None:
 
 
 def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Cross product of two sides of every face, ``(F, 3)``: outward, its length twice the area.  Differentiable."""
+    """Outward face normals ``(F, 3)`` of length twice the area (cross product of two sides).  Differentiable."""
     _check_topology(vertices, faces)
     a, b, c = (vertices.index_select(0, faces[:, k]) for k in range(3))
     return torch.linalg.cross(b - a, c - a)
@@ -113,8 +113,8 @@ def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """Area-weighted unit normals of the vertices, ``(V, 3)``; (0, 0, 1) without gradient where the sum vanishes.
 
-    vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  Gradients reach ``vertices``.  The sum over the faces has a fixed
-    order on CPU.
+    vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  Gradients reach ``vertices``.  On the CPU, faces are summed in a
+    fixed order.
     """
     per_face = face_normals(vertices, faces)
     total = torch.zeros_like(vertices)
@@ -127,9 +127,9 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def weld(vertices: Tensor) -> tuple[Tensor, Tensor]:
-    """``(first (W,), label (V,))`` int64: vertices at bitwise identical positions have one label.
+    """``(first (W,), label (V,))`` int64: vertices at bitwise identical positions share a label.
 
-    ``first`` is the lowest vertex of a label.  Labels count up in the order of ``first``.  -0 equals +0.
+    ``first`` is the lowest vertex index of each label; labels are numbered in the order of ``first``.  -0 equals +0.
     """
     check("vertices", vertices, last=3)
     first, label = weld_rows(vertices.detach().cpu().numpy())
@@ -165,9 +165,9 @@ def face_components(mesh: Mesh) -> Tensor:
 
 
 def select_faces(mesh: Mesh, keep: Tensor) -> Mesh:
-    """The faces that the boolean ``keep (F,)`` marks and the vertices they use, in their old order, with attributes.
+    """The faces where the boolean ``keep (F,)`` is True and their vertices, in their original order, with attributes.
 
-    Gradients of the vertex attributes flow through.
+    Gradients pass through the vertex attributes.
     """
     check("keep", keep, shape=(len(mesh.faces),), like=mesh.faces, dtype=torch.bool)
     faces = mesh.faces[keep]
@@ -181,7 +181,7 @@ def select_faces(mesh: Mesh, keep: Tensor) -> Mesh:
 def largest_components(mesh: Mesh, min_fraction: float = 0.02) -> Mesh:
     """The components with at least ``min_fraction`` of all faces, and always the largest one.
 
-    min_fraction in [0, 1].  A mesh without faces is returned as it is.
+    min_fraction in [0, 1].  A mesh without faces is returned unchanged.
     """
     if not 0.0 <= min_fraction <= 1.0:
         raise ValueError(f"min_fraction: expected a value in [0, 1], got {min_fraction}")
@@ -233,7 +233,7 @@ def report(mesh: Mesh) -> MeshReport:
 
 
 def watertight(mesh: Mesh) -> bool:
-    """Whether the mesh has faces and every edge an even number of them; :func:`report` without the rest."""
+    """Whether the mesh has faces and every edge has an even number of them; only this field of :func:`report`."""
     faces, sound = welded_faces(mesh)
     return bool(sound.any() and (edges_of(faces[sound]).valence % 2 == 0).all())
 

@@ -1,8 +1,8 @@
-"""Rays against a triangle mesh: closest hit and occlusion, on Embree (CPU) or Warp's tree (CPU and CUDA).
+"""Ray casting against a triangle mesh: closest hits and occlusion, by Embree (CPU) or Warp's BVH (CPU and CUDA).
 
-Directions need not have unit length; ``t`` counts in their lengths, from 0 inclusive to ``t_max`` exclusive.  A ray
-misses where nothing is hit, where it holds a NaN, an infinity or a zero direction, and where ``t`` leaves float32.  A
-miss has ``face = -1``, ``t = inf``, ``bary = 0``.  :meth:`RayScene.intersect` has gradients, the others have none.
+Directions may have any length, the unit of ``t``, which ranges from 0 (inclusive) to ``t_max`` (exclusive).  A ray
+misses if it hits nothing, if it contains a NaN, an infinity or a zero direction, or if ``t`` exceeds the range of
+float32.  A miss has ``face = -1``, ``t = inf``, ``bary = 0``.  Only :meth:`RayScene.intersect` has gradients.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ THREAD_SLICES = 2  # of a large call for each thread: the more rays are ordered 
 
 
 class RayScene:
-    """Acceleration structure (BVH) for rays against one triangle mesh; holds a copy of the geometry, without gradient.
+    """Acceleration structure (BVH) for rays against one triangle mesh; holds a detached copy of the geometry.
 
     mesh: a :class:`~reli3d.geometry.mesh.Mesh`, or its vertices ``(V, 3)`` float32 with ``faces (F, 3)`` int32.
     Degenerate faces are never hit; without faces every ray misses.  backend: ``embree`` (CPU, robust mode), ``warp``
     (CPU and CUDA), or ``auto``: Embree on the CPU, where it is about 3 times faster than Warp on incoherent rays, and
-    Warp on CUDA, where the BVH is built on the host.  :meth:`refit` updates moved vertices.  For gradients to the
-    vertices pass them to :meth:`intersect`.  Raises TypeError for a wrong type or dtype; ValueError for a wrong shape,
-    an index out of range, vertices that are not finite, or ``embree`` on CUDA.
+    Warp on CUDA, where the BVH is built on the host.  :meth:`refit` updates moved vertices.  For vertex gradients, pass
+    ``vertices`` to :meth:`intersect`.  Raises TypeError for a wrong type or dtype; ValueError for a wrong shape, an
+    index out of range, non-finite vertices, or ``embree`` on CUDA.
 
     >>> scene = reli3d.RayScene(mesh)
     >>> hits = scene.intersect(origins, directions, vertices=mesh.vertices)
@@ -68,7 +68,7 @@ class RayScene:
         """Replaces the vertex positions ``(V, 3)``; the faces stay.
 
         Warp refits the bounding boxes, which slows down traversal after large motion; Embree rebuilds.  Raises the
-        errors of the constructor, and then leaves the scene unchanged.
+        errors of the constructor; the scene is then unchanged.
         """
         if vertices.shape != self.vertices.shape:
             raise ValueError(f"vertices: expected shape {tuple(self.vertices.shape)}, got {tuple(vertices.shape)}")
@@ -93,15 +93,15 @@ class RayScene:
     ) -> Hits:
         """First hit of every ray, differentiable in the rays and in ``vertices``.
 
-        origins, directions: ``(..., 3)`` float32, broadcast; directions need not be unit, ``t`` is in their lengths.
-        vertices: ``(V, 3)``, the tensor that receives gradients, equal to the positions of the scene (call
-        :meth:`refit` after a change); None: no gradient to the vertices, even if those of the mesh require it.  t_max:
-        a number or ``(...)``, exclusive.  A miss has ``face = -1``, ``t = inf``, ``bary = 0`` and gradient 0.
+        origins, directions: ``(..., 3)`` float32, broadcast; ``directions`` may have any length, the unit of ``t``.
+        vertices: ``(V, 3)``, the tensor that receives gradients, equal to the vertices of the scene (call :meth:`refit`
+        after a change); None: no vertex gradients, even if the mesh's vertices require them.  t_max: a number or
+        ``(...)``, exclusive.  A miss has ``face = -1``, ``t = inf``, ``bary = 0`` and gradient 0.
 
-        Gradients of ``t`` and ``bary`` reach origins, directions and vertices.  The choice of the face has none, so
-        silhouettes need :func:`reli3d.antialias`.  ``origins + t * directions`` is the most accurate hit position.
-        Raises TypeError for a wrong dtype; ValueError for a wrong shape or device, or if ``vertices`` differ from the
-        scene's.  Source: Moller and Trumbore 1997, in float64.
+        Gradients of ``t`` and ``bary`` reach origins, directions and vertices.  The choice of the face is not
+        differentiated, so silhouettes need :func:`reli3d.antialias`.  ``origins + t * directions`` is the most accurate
+        hit position.  Raises TypeError for a wrong dtype; ValueError for a wrong shape or device, or if ``vertices``
+        differ from the scene's.  Source: Moller and Trumbore 1997, in float64.
 
         >>> hits = scene.intersect(origins, directions, vertices=v)
         >>> points = origins[hits.valid] + hits.t[hits.valid][:, None] * directions[hits.valid]
@@ -143,8 +143,8 @@ class RayScene:
     def unoccluded(self, origins: Tensor, directions: Tensor, t_max: Tensor) -> Tensor:
         """Whether a ray hits nothing before its ``t_max``, ``(N,)`` bool; False for ``t_max`` below 0.
 
-        For rays that a kernel has made, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the device, whose neighbors start at
-        about one place.  Values are not checked.
+        For rays generated by a kernel, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the scene's device; neighboring rays
+        should have nearby origins.  Values are not checked.
         """
         if self._embree is None:
             return (t_max >= 0.0) & ~self.occluded(origins, directions, t_max=t_max)
@@ -261,9 +261,9 @@ def _items(values: Tensor) -> np.ndarray:
 def offset_origin(position: Tensor, ng: Tensor, direction: Tensor, *, scale: float = 1.0) -> Tensor:
     """Origins ``(..., 3)`` for rays that start on a face and must not hit it.
 
-    position: ``(..., 3)`` on the face.  ng: ``(..., 3)`` unit geometric normal, of either side; 0 (a face without area)
-    moves nothing.  direction: ``(..., 3)`` of the ray.  scale: largest coordinate of the mesh (``RayScene.scale``).  No
-    gradient.
+    position: ``(..., 3)`` on the face.  ng: ``(..., 3)`` unit geometric normal, on either side; 0 (a degenerate face)
+    leaves the position unchanged.  direction: ``(..., 3)`` of the ray.  scale: largest coordinate of the mesh
+    (``RayScene.scale``).  No gradient.
     """
     check("position", position, last=3)
     check("ng", ng, last=3, like=position)

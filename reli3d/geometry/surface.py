@@ -3,8 +3,8 @@
 A grid of X * Y * Z cubes fills the box [-radius, radius]^3.  Grid vertices ``(X + 1, Y + 1, Z + 1)`` and cubes ``(X, Y,
 Z)`` are in C order (x slowest, z fastest).  Corners of a cube are numbered with x fastest: corner = x + 2y + 4z for x,
 y, z in {0, 1}; edges as in ``kernels.flexicubes_tables.EDGES``.  Vertices and faces are in the order of the authors'
-code.  After one pass over the grid the cost is proportional to the number of surface cubes.  Not
-implemented: the tetrahedra of their section 4.5, and dual vertices placed by the field's gradient.
+code.  After one pass over the grid the cost is proportional to the number of surface cubes.  Not implemented: the
+tetrahedra of the paper's section 4.5, and dual vertices placed by the field's gradient.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _struct_of_tables(device: torch.device) -> kernels.Tables:
 
 
 def surface_cubes(sdf: Tensor) -> Tensor:
-    """Index ``(x * Y + y) * Z + z`` of the cubes with a sign change, ``(K,)`` int64 ascending; only these have weights.
+    """Indices ``(x * Y + y) * Z + z`` of cubes with a sign change, ``(K,)`` int64 ascending; only these have weights.
 
     sdf: ``(X + 1, Y + 1, Z + 1)`` float32.
     """
@@ -94,12 +94,12 @@ def extract_surface(
 ) -> Mesh:
     """Extracts the isosurface ``sdf == 0`` in the box ``[-radius, radius]^3`` by FlexiCubes; the mesh has no normals.
 
-    sdf: ``(X + 1, Y + 1, Z + 1)`` float32 at the grid vertices (C order: x slowest, z fastest), finite: a signed
+    sdf: ``(X + 1, Y + 1, Z + 1)`` float32 at the grid vertices (C order: x slowest, z fastest), finite; a signed
     distance or any other field that is negative inside.  radius: half extent of the box, one or three numbers.
-    deformation: ``(*sdf.shape, 3)`` offsets of the grid vertices, as fractions of the sides ``2 * radius`` of the box.
-    alpha ``(K, 8)``, beta ``(K, 12)``, gamma ``(K,)``: positive weights of cube corners, of cube edges and of the
-    splitting of quads; None: 1.  Without ``cubes``, K is the number of all cubes, X * Y * Z.  cubes: ``(K,)`` int64
-    from :func:`~reli3d.geometry.surface.surface_cubes`: the weights have rows for these cubes only.  closed: cap the
+    deformation: ``(*sdf.shape, 3)`` offsets of the grid vertices, as fractions of the box sides ``2 * radius``.  alpha
+    ``(K, 8)``, beta ``(K, 12)``, gamma ``(K,)``: positive weights for cube corners, cube edges and quad splitting;
+    None: 1.  K is the number of all cubes, X * Y * Z, unless ``cubes`` is given.  cubes: ``(K,)`` int64 from
+    :func:`~reli3d.geometry.surface.surface_cubes`; the weights then have rows for these cubes only.  closed: cap the
     surface at the box.  center: split each quad into four triangles around an additional vertex, instead of into two.
 
     Faces are counter-clockwise seen from the positive side.  A field of one sign is valid: a positive one gives an
@@ -108,7 +108,7 @@ def extract_surface(
 
     Raises TypeError for a wrong dtype, and ValueError in these cases: a wrong shape; NaN or infinity in ``sdf``;
     ``radius`` or ``gamma`` not positive; ``alpha``, ``beta`` or ``deformation`` that lead to non-finite vertices;
-    ``cubes`` that are not those of ``sdf``; 2^31 or more grid vertices.  Source: Shen et al. 2023.
+    ``cubes`` that do not match ``sdf``; 2^31 or more grid vertices.  Source: Shen et al. 2023.
 
     >>> x = torch.linspace(-1, 1, 17)
     >>> ball = reli3d.extract_surface((x**2 + x[:, None] ** 2 + x[:, None, None] ** 2).sqrt() - 0.5, radius=1.0)
@@ -140,7 +140,7 @@ def check_fields(
     gamma: Tensor | None,
     cubes: Tensor | None,
 ) -> list[float]:
-    """Raise for what :func:`extract_surface` cannot take; returns the three radii."""
+    """The three radii.  Raises the errors of :func:`extract_surface` for invalid arguments."""
     _check_sdf(sdf)
     size = tuple(n - 1 for n in sdf.shape)
     extent = [radius] * 3 if isinstance(radius, (int, float)) else list(radius)
@@ -184,7 +184,7 @@ def _classify(sdf: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def topology_of(sdf: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topology, Tensor, Tensor]:
-    """Topology, the padded sdf and the crossed edges of its vertices."""
+    """Topology, padded sdf, and the crossed edges of the padded grid's vertices."""
     device, size = sdf.device, tuple(n - 1 for n in sdf.shape)
     border = [sdf[0], sdf[-1], sdf[:, 0], sdf[:, -1], sdf[:, :, 0], sdf[:, :, -1]]
     pad = int(closed and any(bool((side < 0).any()) for side in border))

@@ -98,12 +98,12 @@ class _SampleTriplane(torch.autograd.Function):
 
 
 def sizes_of(points: int, height: int, width: int, blocks: int) -> kernels.Sizes:
-    """Kernel struct of the numbers of points, texels of a plane and blocks of 8 channels."""
+    """Kernel struct with the numbers of points, texels per plane and blocks of 8 channels."""
     return struct_of(kernels.Sizes, points=points, height=height, width=width, blocks=blocks)
 
 
 def packed_planes(planes: Tensor) -> Tensor:
-    """``(B, 3, H, W, C')`` float32, C' the next multiple of 8; no copy if the planes are in this format already."""
+    """``(B, 3, H, W, C')`` float32, C' the next multiple of 8; no copy if the planes already have this layout."""
     packed = planes.detach().permute(0, 1, 3, 4, 2)
     packed = (
         torch.nn.functional.pad(packed, (0, -planes.shape[2] % BLOCK_CHANNELS))
@@ -196,13 +196,13 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
 
 
 def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
-    """Features of ``points``, ``(B, N, 3 * C)`` float32: bilinear from the planes XY, XZ, YZ, in that order.
+    """Samples features ``(B, N, 3 * C)`` float32 at ``points``, bilinearly from the planes XY, XZ, YZ, in that order.
 
     planes: ``(B, 3, C, H, W)`` float32, bfloat16 or float16; interpolated in float32.  The first coordinate of a plane
     runs along W, the second along H.  Borders are as in ``grid_sample`` with ``align_corners=False`` and
     ``padding_mode="zeros"``: -1 and 1 are the outer edges of the border texels, and texels outside are zero.  Planes
-    are read without a copy if they are float32, C is a multiple of 8 and channels are last in memory; others are
-    converted to that format.  points: ``(B, N, 3)`` float32 in [-1, 1]; NaN gives zeros.
+    are read without a copy if they are float32, C is a multiple of 8 and channels are last in memory; otherwise they
+    are converted to this layout.  points: ``(B, N, 3)`` float32 in [-1, 1]; NaN gives zeros.
 
     Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centers), bitwise identical for any
     number of threads.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device, or for sizes beyond
@@ -216,7 +216,7 @@ def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
 
 
 def check_triplane(planes: Tensor, points: Tensor) -> None:
-    """Raise TypeError or ValueError where :func:`sample_triplane` cannot take these."""
+    """Raises the errors of :func:`sample_triplane` for invalid arguments."""
     if not isinstance(planes, Tensor):
         raise TypeError(f"planes: expected a tensor, got {type(planes).__name__}")
     if planes.dtype not in (torch.float32, torch.bfloat16, torch.float16):

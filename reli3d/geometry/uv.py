@@ -1,8 +1,8 @@
-"""UV atlas: charts by projection, packed with a guard band; xatlas in a process of its own is the other choice.
+"""UV atlases: charts by projection, packed with a guard band, or charts by xatlas in a separate process.
 
 UV follow glTF: u right, v down, [0, 1].  Seen from outside, charts are not mirrored: in (u, 1 - v) every face is
-counter-clockwise.  The atlas is made on the CPU and ``uv`` has no gradient.  Vertices and normals of the result are a
-gather of the input's and pass gradients on.
+counter-clockwise.  The atlas is computed on the CPU, and ``uv`` has no gradient.  The result's vertices and normals are
+gathered from the input, and gradients pass through.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ numpy.savez(sys.argv[2], source=source, faces=faces, uv=uv)
 
 
 def guard_band(texture_size: int) -> int:
-    """Texels kept free between charts: 4 at 512 and 1024, more for larger textures, 2 at least for small ones."""
+    """Texels kept free between charts: 4 at 512 and 1024, more for larger textures, at least 2 for smaller ones."""
     return max(4, texture_size // 256) if texture_size >= 512 else max(2, texture_size // 128)
 
 
@@ -62,13 +62,13 @@ def _check(mesh: Mesh, texture_size: int) -> None:
 def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
     """Adds a texture atlas to a mesh: ``uv (V', 2)`` in [0, 1], u right, v down, without overlap.
 
-    texture_size: texels per side, 16 to 16384, for which the gaps between charts are sized, see
+    texture_size: 16 to 16384 texels per side; determines the gaps between charts, see
     :func:`~reli3d.geometry.uv.guard_band`.  Vertices are split at chart borders; faces keep their order, and each has
     positive UV area.  Normals are kept, or computed before the split, so that shading stays smooth across charts.
     Accepts any triangle mesh: open, non-manifold, disconnected, with degenerate faces.  Deterministic.
 
     Gradients pass through vertices and normals; ``uv`` has none.  Raises TypeError for a wrong type; ValueError for a
-    mesh without faces, vertices that are not finite, or a texture size out of range.
+    mesh without faces, non-finite vertices, or a texture size out of range.
 
     >>> charted = reli3d.unwrap(mesh, texture_size=64)
     >>> maps = reli3d.bake(charted, 64, lambda position, normal: position.abs())
@@ -226,10 +226,10 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
 
 
 def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 120.0) -> Mesh:
-    """As :func:`unwrap` with the charts of xatlas (Young 2018), in a process of its own that ends after ``timeout_s``.
+    """As :func:`unwrap`, with charts by xatlas (Young 2018), in a separate process, ended after ``timeout_s``.
 
-    Its time grows with the square of the number of charts and it can crash; here that is a TimeoutError or RuntimeError
-    instead of a hang.  Faces that xatlas could not chart may overlap in UV.
+    The time of xatlas grows with the square of the number of charts, and xatlas can crash.  Raises TimeoutError or
+    RuntimeError in these cases instead of hanging.  Faces that xatlas cannot chart may overlap in UV.
     """
     _check(mesh, texture_size)
     with tempfile.TemporaryDirectory() as folder:
@@ -269,10 +269,10 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
 
 
 def source_vertices(whole: Mesh, mesh: Mesh) -> Tensor:
-    """Vertex of ``whole`` that each vertex of ``mesh``, its result of :func:`unwrap`, was split from: ``(V,)`` int32.
+    """Vertex of ``whole`` that :func:`unwrap` copied to each vertex of ``mesh``, ``(V,)`` int32.
 
-    Faces and their corners have the same order in both; a vertex without a face gets 0.  Raises ValueError where the
-    numbers of faces differ.
+    mesh: the unwrapped ``whole``.  Faces and their corners have the same order in both meshes; a vertex without a face
+    gets 0.  Raises ValueError if the numbers of faces differ.
     """
     if whole.faces.shape != mesh.faces.shape:
         raise ValueError(f"mesh.faces: expected {len(whole.faces)} faces, got {len(mesh.faces)}")

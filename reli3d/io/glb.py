@@ -35,7 +35,7 @@ WRAPS = {"repeat": 10497, "mirror": 33648, "clamp": 33071}
 
 
 def encode_image(values: Tensor, kind: str = "png") -> bytes:
-    """PNG or lossless WebP file, 8 bit RGB, of ``(H, W, 3)`` values in [0, 1], rounded to the nearest step."""
+    """PNG or lossless WebP file, 8-bit RGB, of ``(H, W, 3)`` values in [0, 1], rounded to the nearest 1/255."""
     pixels = np.ascontiguousarray((values.detach() * 255.0).round_().to(torch.uint8).cpu().numpy())
     if kind == "png":
         return png_bytes(pixels)
@@ -45,7 +45,7 @@ def encode_image(values: Tensor, kind: str = "png") -> bytes:
 
 
 def texture_images(asset: Asset, kind: str = "png") -> dict[str, bytes]:
-    """The files of ``base_color``, ``metallic_roughness`` (green roughness, blue metallic, red 1) and ``normal``."""
+    """Encoded images ``base_color``, ``metallic_roughness`` (green roughness, blue metallic, red 1) and ``normal``."""
     rough = asset.textures.roughness
     orm = torch.stack([torch.ones_like(rough), rough, asset.textures.metallic], -1)  # no occlusion is baked
     base_color = linear_to_srgb(asset.textures.base_color)
@@ -55,7 +55,7 @@ def texture_images(asset: Asset, kind: str = "png") -> dict[str, bytes]:
 
 
 def addressing(asset: Asset) -> tuple[str, str]:
-    """Wrap modes for a file: those of the textures, but "clamp" for "repeat" where uv stay within [0, 1]."""
+    """Wrap modes for a file: those of the textures, with "repeat" replaced by "clamp" if UV stay within [0, 1]."""
     low, high = torch.aminmax(present("uv", asset.mesh.uv).detach(), dim=0)
     inside = ((low >= 0.0) & (high <= 1.0)).tolist()
     first, second = ("clamp" if m == "repeat" and i else m for m, i in zip(asset.textures.wrap, inside, strict=True))
@@ -63,14 +63,14 @@ def addressing(asset: Asset) -> tuple[str, str]:
 
 
 def portable(asset: Asset) -> bool:
-    """Whether OBJ and USD can hold ``asset``: no vertex colors, and textures that repeat or are used within [0, 1]."""
+    """Whether OBJ and USD can represent ``asset``: no vertex colors, and textures that repeat or have UV in [0, 1]."""
     uv = present("uv", asset.mesh.uv).detach()
     inside = bool(((uv >= 0.0) & (uv <= 1.0)).all())
     return asset.mesh.colors is None and (inside or asset.textures.wrap == ("repeat", "repeat"))
 
 
 def check_asset(asset: Asset) -> None:
-    """Raises TypeError or ValueError for an asset with missing attributes, values out of range or not finite."""
+    """Raises TypeError or ValueError for an asset with missing attributes or with values out of range or non-finite."""
     expect("asset", asset, Asset)
     mesh = asset.mesh
     if len(mesh.faces) == 0:
@@ -211,13 +211,13 @@ def write_glb(
 ) -> None:
     """Writes mesh and textures of ``asset`` as a GLB file, completely or not at all; the environment is not written.
 
-    asset: its mesh needs normals, UV and tangents, as :func:`reconstruct` and :func:`read_glb` return them;
-    :func:`unwrap` adds UV and normals to other meshes, :meth:`Mesh.with_tangents` tangents.  extras:
-    JSON values for glTF's ``asset.extras``.  double_sided: None: false for a watertight mesh, otherwise true.
-    translation: of the node, for objects so far from the origin that float32 vertices would lose precision.  textures:
-    ``png``, or ``webp`` (lossless, smaller, needs a viewer with ``EXT_texture_webp``).  Raises TypeError for a wrong
-    type; ValueError for missing attributes, values that are not finite or not in [0, 1], normals that are not unit, or
-    4 GiB or more; OSError if writing fails.
+    asset: its mesh needs normals, UV and tangents, as returned by :func:`reconstruct` and :func:`read_glb`; for other
+    meshes, :func:`unwrap` adds UV and normals, and :meth:`Mesh.with_tangents` adds tangents.  extras: JSON values for
+    glTF's ``asset.extras``.  double_sided: if None, false for a watertight mesh, otherwise true.  translation: of the
+    node, for objects so far from the origin that float32 vertices would lose precision.  textures: ``png``, or ``webp``
+    (lossless, smaller, needs a viewer with ``EXT_texture_webp``).  Raises TypeError for a wrong type; ValueError for
+    missing attributes, values that are non-finite or outside [0, 1], non-unit normals, or a file of 4 GiB or more;
+    OSError if writing fails.
 
     >>> reli3d.write_glb("object.glb", asset, extras={"license": "CC0-1.0"})
     >>> parts = reli3d.read_glb("object.glb")
@@ -228,12 +228,12 @@ def write_glb(
 
 @full_precision
 def read_glb(path: str | os.PathLike, *, notes: list[str] | None = None, **limits: int) -> list[Asset]:
-    """Reads a GLB file: one :class:`Asset` per primitive, in the axes of its scene, without environment.
+    """Reads a GLB file: one :class:`Asset` per primitive, in scene coordinates, without environment.
 
-    Node transforms, skins in the rest pose and morph targets by their default weights are applied.  Vertex colors
-    become ``Mesh.colors``, or are multiplied into the textures if uniform.  Textures are resampled to squares of one
-    size, with all factors and texture transforms applied.  Missing normals are face normals, missing tangents follow
-    MikkTSpace.  Specular-glossiness materials are converted.
+    Node transforms, skins in the rest pose and morph targets with their default weights are applied.  Vertex colors
+    become ``Mesh.colors``, or are multiplied into the textures if uniform.  Textures are resampled to squares of equal
+    size, with all factors and texture transforms applied.  Missing normals become face normals; missing tangents are
+    computed by MikkTSpace.  Specular-glossiness materials are converted.
 
     notes: receives one line for every feature that is ignored (animation, emission, occlusion, alpha, points, lines,
     extensions such as clearcoat).  Compressed data (Draco, meshopt, KTX2) is an error.  limits: see
