@@ -1,4 +1,4 @@
-"""The error of every layer for input that its user can correct."""
+"""The error that every layer raises for input that the user can correct."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from __future__ import annotations
 class InputError(ValueError):
     """Input that cannot be used.  The text is one line: the file or option, the field, the value and the fix.
 
-    Commands exit with 2 for it, and with 1 for every other exception.
+    Commands exit with 2 for this error, and with 1 for every other exception.
     """
 
     def __init__(self, where: object, problem: str):

@@ -1,4 +1,4 @@
-"""Silhouette coverage: lowers a signed field along the rays of silhouette pixels that hit no surface."""
+"""Silhouette coverage: lowers a signed field along rays inside the silhouettes that miss the surface."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Came
     """Lowers ``sdf (X, Y, Z)`` so that every ray inside the views' silhouettes hits the surface; no gradient.
 
     sdf: negative inside, on a grid over [-radius, radius]^3, in occupancy logits or in distances divided by the
-    softness.  bound: ``(X, Y, Z)``, a lower bound of ``sdf`` and of the result.  distance, camera: as in
-    :func:`reli3d.geometry.hull.hull_distance`, at least ``2 STRIDE`` pixels a side.  Without views the result is a copy
-    of ``sdf``.
+    softness.  bound: ``(X, Y, Z)``, a lower bound on ``sdf`` and on the result.  distance, camera: as in
+    :func:`reli3d.geometry.hull.hull_distance`, at least ``2 STRIDE`` pixels per side.  Without views, the result is a
+    copy of ``sdf``.
 
     Predicted fields often stay slightly above 0 along rays through thin parts.  One ray is traced for every
     ``STRIDE``-th pixel of each axis; if the minimum m along it is in (-DEPTH, FIELD_MAX), m + DEPTH is subtracted along

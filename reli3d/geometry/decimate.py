@@ -1,6 +1,6 @@
-"""Fewer triangles for a surface, through ``fast-simplification`` (MIT), an optional install.
+"""Decimation of a surface by ``fast-simplification`` (MIT), an optional dependency.
 
-``manifold3d`` can simplify too, but takes a tolerance instead of a count, and solids only.
+``manifold3d`` can decimate too, but it takes a tolerance instead of a face count, and accepts solids only.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ def _mesh(positions: np.ndarray, faces: np.ndarray, like: Mesh) -> Mesh:
 
 
 def decimate(mesh: Mesh, faces: int) -> Mesh:
-    """The surface with about ``faces`` triangles, by collapsing edges in the order of their quadric error.
+    """Decimates the surface to about ``faces`` triangles by collapsing edges in order of quadric error.
 
-    Works on the welded positions on the CPU.  The result has positions and faces alone, on the device of ``mesh``, and
-    no gradient: normals, UV and tangents belong to the old triangles.
+    Works on the welded positions on the CPU.  The result has only positions and faces, on the device of ``mesh``, and
+    no gradient; normals, UV and tangents are dropped because they belong to the original triangles.
 
-    Garland and Heckbert 1997, Surface simplification using quadric error metrics, through ``fast-simplification``
-    (``pip install 'reli3d[mesh]'``).  The result has at most ``faces`` faces unless no collapse is left that turns no
-    face over, and it may have a few non-manifold edges (:func:`reli3d.geometry.mesh.report` counts them).
-    Deterministic.  A surface with at most ``faces`` faces is only welded.
+    The result has at most ``faces`` faces unless every remaining collapse would flip a face, and it may have a few
+    non-manifold edges (:func:`reli3d.geometry.mesh.report` counts them).  A surface with at most ``faces`` faces is
+    only welded.  Deterministic.  Source: Garland and Heckbert 1997, Surface simplification using quadric error metrics,
+    through ``fast-simplification`` (``pip install 'reli3d[mesh]'``).
 
     Raises ValueError unless ``faces`` is at least 4 and positions are finite, ImportError without the library.
     """

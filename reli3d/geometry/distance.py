@@ -1,4 +1,4 @@
-"""Signed distance to closed meshes, the ground truth of volume points in training."""
+"""Signed distance to closed meshes, the ground truth for volume points in training."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from reli3d.kernels import distance as kernels
 
 
 def signed_distance(vertices: Tensor, faces: Tensor, points: Tensor) -> Tensor:
-    """Distance ``(N,)`` from ``points`` ``(N, 3)`` to a closed, outward oriented mesh, negative inside, in the units
-    of the mesh.
+    """Signed distance ``(N,)`` from ``points (N, 3)`` to a closed, outward-oriented mesh; negative inside.
 
-    vertices: ``(V, 3)`` float32; faces: ``(F, 3)`` int32.  No autograd.  On a mesh with holes the sign has no meaning;
-    a NaN point gives NaN.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device, an empty mesh or
-    an index out of range.
+    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  The distance is in the units of the mesh.  No gradient.
+    For a mesh with holes, the sign is undefined; a NaN point gives NaN.  Raises TypeError for a wrong dtype, ValueError
+    for a wrong shape or device, an empty mesh or an index out of range.
     """
     _bridge.check("vertices", vertices, shape=("V", 3))
     _bridge.check("faces", faces, shape=("F", 3), like=vertices, dtype=torch.int32)

@@ -1,8 +1,8 @@
-"""Embree's triangle tree by its C interface, in the library that the embreex wheel brings.
+"""Embree's BVH through its C interface, from the library in the embreex wheel.
 
-embreex's own calls copy every ray into and out of memory of their own and know no packets.  Here a tree is built, and
-:mod:`reli3d.kernels.embree` traces rays in it, by the addresses of Embree's functions.  Names and constants: Embree 4
-API reference, https://github.com/RenderKit/embree.
+embreex itself copies every ray in and out and has no packets.  This module builds the BVH; :mod:`reli3d.kernels.embree`
+traces rays in it by the addresses of Embree's functions.  Names and constants: Embree 4 API reference,
+https://github.com/RenderKit/embree.
 """
 
 from __future__ import annotations
@@ -60,15 +60,16 @@ def _embree() -> tuple[ctypes.CDLL, int]:
 def query(name: str) -> int:
     """Address of ``rtcIntersect1``, ``rtcOccluded1`` or ``rtcOccluded16``, for a kernel.
 
-    A processor without vectors of 16 floats takes the packet too: Embree then traces its rays one by one.
+    Packets also work on a processor without vectors of 16 floats: Embree then traces the rays one by one.
     """
     return ctypes.cast(getattr(_embree()[0], name), POINTER).value or 0
 
 
 class Tree:
-    """Embree scene of triangles in robust mode; ``scene``: its handle, valid during the lifetime of the object.
+    """Embree scene of triangles in robust mode; ``scene``: its handle, valid while the object exists.
 
-    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32 in [0, V).  Raises RuntimeError if Embree cannot build it.
+    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32 in [0, V).  Raises RuntimeError if Embree cannot build the
+    scene.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):

@@ -15,8 +15,8 @@ ROWS_MIN = 256  # fewest rows of a grid in a slice of a launch on a CPU: some 30
 def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
     """Trilinear interpolation ``(N, C)`` of ``grid (X, Y, Z, C)``, which spans [-1, 1]^3, at ``points (N, 3)``.
 
-    The outermost grid points lie at -1 and 1; points outside are clamped to the border.  At least 2 grid points along
-    each axis.  Gradients reach both arguments.  Raises TypeError unless float32, ValueError for a wrong shape or
+    The outermost grid points lie at -1 and 1; points outside are clamped to the border.  Each axis needs at least 2
+    grid points.  Gradients reach both arguments.  Raises TypeError unless float32, ValueError for a wrong shape or
     device.
     """
     check("grid", grid)
@@ -32,9 +32,9 @@ def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
 def squared_laplacian(field: Tensor, weight: Tensor) -> Tensor:
     """Weighted sum ``()`` of the squared 7-point Laplacian over the inner points of a grid.
 
-    field, weight: ``(X, Y, Z)`` float32.  Border points, and points whose ``weight`` is 0, enter as neighbors only.
-    First-order gradients reach ``field``; ``weight`` is a constant.  Raises TypeError for a
-    wrong dtype, ValueError for a wrong shape or device.
+    field, weight: ``(X, Y, Z)`` float32.  Border points, and points whose ``weight`` is 0, contribute only as
+    neighbors.  First-order gradients reach ``field``; ``weight`` is a constant.  Raises TypeError for a wrong dtype,
+    ValueError for a wrong shape or device.
     """
     check("field", field)
     check("weight", weight, like=field)

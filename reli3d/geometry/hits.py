@@ -1,6 +1,6 @@
-"""Differentiable evaluation of hits: the hit itself re-evaluated, vertex attributes and geometric normals at hits.
+"""Differentiable evaluation of hits: the hit itself, vertex attributes and geometric normals.
 
-Which face is hit has no gradient; everything evaluated at the hit has one.
+The choice of the hit face has no gradient; everything evaluated at the hit has gradients.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from reli3d.kernels import hits as kernels
 class Hits:
     """First hits of rays, from :meth:`reli3d.RayScene.intersect`.
 
-    face: ``(...)`` int32, -1 for a miss.  t: ``(...)`` ray parameter, the hit being at ``origin + t * direction``; inf
-    for a miss.  bary: ``(..., 2)`` weights of the face's vertices 1 and 2, with ``1 - b1 - b2``
-    for vertex 0; 0 for a miss.  valid: ``face >= 0``.  ``t`` and ``bary`` have gradients to the rays, and to the
-    vertices passed to ``intersect``.
+    face: ``(...)`` int32, -1 for a miss.  t: ``(...)`` ray parameter: the hit is at ``origin + t * direction``; inf for
+    a miss.  bary: ``(..., 2)`` weights of the face's vertices 1 and 2; the weight of vertex 0 is ``1 - b1 - b2``; 0 for
+    a miss.  valid: ``face >= 0``.  Gradients of ``t`` and ``bary`` reach the rays, and the vertices passed to
+    ``intersect``.
 
     >>> hits = reli3d.RayScene(mesh).intersect(origins, directions)
     >>> points = reli3d.surface_points(mesh, None, hits.face[hits.valid], hits.bary[hits.valid])
@@ -46,7 +46,7 @@ _INTERPOLATE = {
 
 
 def interpolate(values: Tensor, faces: Tensor, face: Tensor, bary: Tensor) -> Tensor:
-    """Vertex attribute ``(V, C)``, C = 2, 3 or 4, at hits: ``(..., C)``, 0 at a miss.
+    """Vertex attribute ``values (V, C)``, C = 2, 3 or 4, interpolated at hits: ``(..., C)``, 0 for a miss.
 
     faces: ``(F, 3)`` int32.  face: ``(...)`` int32, -1 for a miss.  bary: ``(..., 2)``.  Gradients reach ``values`` and
     ``bary``.  Raises ValueError for an index out of range.
@@ -64,7 +64,7 @@ def interpolate(values: Tensor, faces: Tensor, face: Tensor, bary: Tensor) -> Te
 
 
 def hit_normals(vertices: Tensor, faces: Tensor, face: Tensor) -> Tensor:
-    """Unit geometric normals ``(..., 3)`` of hit faces ``(...)``, 0 at a miss or on a face without area.
+    """Unit geometric normals ``(..., 3)`` of hit faces ``(...)``; 0 for a miss or a degenerate face.
 
     Gradients reach ``vertices (V, 3)``.
     """
@@ -79,11 +79,11 @@ def hit_normals(vertices: Tensor, faces: Tensor, face: Tensor) -> Tensor:
 def evaluate_hits(vertices: Tensor, faces: Tensor, hits: Hits, origins: Tensor, directions: Tensor) -> Hits:
     """``hits`` with differentiable ``t`` and ``bary``, recomputed from their faces.
 
-    vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  origins, directions: ``(..., 3)`` of the rays that gave ``hits``.
+    vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  origins, directions: ``(..., 3)``, the rays that produced ``hits``.
     Gradients reach vertices, origins and directions; visibility is constant.  Values and gradients are computed in
-    float64.  Hits on faces that are nearly degenerate or seen nearly edge-on are kept unchanged, with gradient 0.  Use
-    ``origins + t directions`` for the point, whose gradient in the vertices is more accurate than that of an
-    interpolated position.  Source: Moller and Trumbore 1997.
+    float64.  Hits on faces that are nearly degenerate or seen nearly edge-on are kept unchanged, with gradient 0.  For
+    the hit position, use ``origins + t directions``: its gradient with respect to the vertices is more accurate than
+    the gradient of an interpolated position.  Source: Moller and Trumbore 1997.
     """
     check("vertices", vertices, last=3)
     _check_faces(vertices.shape[0], faces, hits.face, vertices)

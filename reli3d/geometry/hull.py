@@ -1,4 +1,4 @@
-"""Visual hull of an object from the masks of posed images, as a signed distance; positive inside throughout."""
+"""Visual hull of an object from the masks of posed images, as a signed distance that is positive inside."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ BLOCKS_MIN = 64  # blocks of a grid in a CPU slice: each of them has 64 points
 
 
 def mask_distance(masks: Tensor) -> Tensor:
-    """Signed distance of every pixel center to the mask's contour, ``(V, H, W)`` in pixels, positive inside.
+    """Signed distance ``(V, H, W)`` [pixels] from every pixel center to the mask's contour, positive inside.
 
-    masks: ``(V, H, W)`` float32 coverage in [0, 1].  The contour is where the mask, bilinear between pixel centers, is
-    0.5, as straight segments (marching squares).  Near the contour the distance is exact; far from it, it can be a
-    fraction of a pixel too long, because only segments around the nearest crossing are evaluated.  The image border is
-    no contour: a mask that touches it continues outside.  A view without contour has the length of the image diagonal
-    everywhere, positive or negative.  No gradient.
+    masks: ``(V, H, W)`` float32 coverage in [0, 1].  The contour is the 0.5 isoline of the mask, bilinear between pixel
+    centers, as straight segments (marching squares).  The distance is exact near the contour; far from it, the distance
+    can be a fraction of a pixel too long, because only segments around the nearest crossing are evaluated.  The image
+    border is not a contour: a mask that touches the border continues outside.  In a view without contour, the distance
+    is plus or minus the image diagonal everywhere.  No gradient.
     """
     check("masks", masks)
     if masks.ndim != 3 or min(masks.shape[1:]) < 2 or max(masks.shape[1:]) > 8192:
@@ -65,11 +65,12 @@ def _nearest_crossing(masks: Tensor) -> list:
 def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: float = math.inf) -> Tensor:
     """Signed distance ``(N,)`` of points to the visual hull, world units, positive inside: the minimum over the views.
 
-    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  camera: of these V views.  The distance in
-    a view is the pixel distance where the point projects, times depth / focal length, which overestimates by up to 1 /
-    cos^2 of the angle to the optical axis.  Outside the image the border value is used, so a silhouette cut off there
-    is unbounded.  Points at or behind a camera's plane get -1000.  Without views every point gets +1000.  far: at least
-    0, world units, else ValueError; points farther outside get any value below ``-far``, to save time.  No gradient.
+    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  camera: a batch of these V views.  The
+    distance in a view is the pixel distance at the point's projection times depth / focal length, which overestimates
+    by a factor of up to 1 / cos^2 of the angle to the optical axis.  Outside the image, the border value is used, so a
+    silhouette that is cut off there is unbounded.  Points at or behind a camera's plane get -1000.  Without views,
+    every point gets +1000.  far: at least 0, world units, else ValueError; to save time, points farther outside may get
+    any value below ``-far``.  No gradient.
     """
     check("points", points, shape=("N", 3))
     _check_views(points, distance, camera)
@@ -101,11 +102,11 @@ def hull_grid(axis: Tensor, distance: Tensor, camera: Camera, *, far: float = ma
 def mirror_residual(
     points: Tensor, known: Tensor, normal: Tensor, offset: Tensor, most: float, distance: Tensor, camera: Camera
 ) -> Tensor:
-    """Least distance outside the visual hull of the mirror images of a ray's points, ``(P, R)``, clamped to ``most``.
+    """Least distance ``(P, R)`` outside the visual hull over the mirrored points of each ray, clamped to ``most``.
 
-    points: ``(R, D, 3)``, D along each ray.  known: ``(R, D)`` bool, the points used; a ray without any gets ``most``.
-    normal: ``(P, 3)`` unit, offset: ``(P,)``, of P planes.  most: at least 0, world units, else ValueError.  The other
-    arguments are those of :func:`hull_distance`.  No gradient.
+    points: ``(R, D, 3)``, D points along each ray.  known: ``(R, D)`` bool, the points to use; a ray without such
+    points gets ``most``.  normal: ``(P, 3)`` unit, offset: ``(P,)``: P planes.  most: at least 0, world units, else
+    ValueError.  The other arguments are those of :func:`hull_distance`.  No gradient.
     """
     check("points", points, last=3)
     check("normal", normal, last=3, like=points)
@@ -132,9 +133,9 @@ def hull_span(origins: Tensor, directions: Tensor, radius: float, distance: Tens
     """Ray parameters ``(N, 2)`` of the first entry into the visual hull and the last exit.
 
     origins, directions: ``(N, 3)``, directions nonzero, of any length.  radius: of a sphere around the world origin
-    that clips the hull.  The other arguments are those of :func:`hull_distance`.  For a ray that misses the hull both
-    are the parameter of the closest approach.  Parts thinner than 0.004 along the ray may be missed.  Sphere tracing,
-    Hart 1996.  No gradient.
+    that clips the hull.  The other arguments are those of :func:`hull_distance`.  For a ray that misses the hull, both
+    are the parameter of the closest approach.  Parts thinner than 0.004 along the ray may be missed.  No gradient.
+    Source: sphere tracing of Hart 1996.
     """
     check("origins", origins, last=3)
     check("directions", directions, last=3, like=origins)

@@ -13,10 +13,10 @@ from reli3d.kernels.projection import gather_views_kernel
 def gather_views(maps: Tensor, points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Bilinear values ``(N, V, C)`` of ``maps`` where ``points`` project, and pixel x, y and depth ``(N, V, 3)``.
 
-    maps: ``(V, H, W, C)``, at least 2 by 2 pixels.  points: ``(N, 3)`` world.  camera: of V views; the maps show its
-    whole image in any resolution, and the pixels are those of the maps.  Outside a map its border value is taken.
-    Gradients reach ``maps`` and ``points``; the pixels carry the gradient of the points too.  Raises TypeError unless
-    float32, ValueError for a wrong shape or device.
+    maps: ``(V, H, W, C)``, at least 2 by 2 pixels.  points: ``(N, 3)`` world.  camera: a batch of V views; the maps
+    show the whole image at any resolution, and x and y are in pixels of the maps.  Outside a map, the border value is
+    used.  Gradients reach ``maps`` and ``points``; pixel coordinates and depth are differentiable in ``points`` too.
+    Raises TypeError unless float32, ValueError for a wrong shape or device.
     """
     check("maps", maps)
     check("points", points, last=3, like=maps)

@@ -1,6 +1,6 @@
 """Regularizers for fitting a FlexiCubes surface (Shen et al. 2023, section 4.3).
 
-Both are plain torch on the surface cubes only; gradients reach every input, in float32 as in the extraction.
+Both are plain torch operations on the surface cubes only; gradients reach every input, in float32 as in the extraction.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ def vertex_deviation(
     cubes: Tensor | None = None,
     closed: bool = True,
 ) -> Tensor:
-    """L_dev of every dual vertex, ``(D,)`` in units of ``radius``; its mean is the loss.
+    """L_dev ``(D,)`` of the dual vertices, in units of ``radius``; the mean is the loss.
 
-    L_dev is the mean absolute deviation of the distances between a dual vertex and the zero crossings that it averages.
-    A small value keeps the vertex inside its polygon and the faces free of folds.  Arguments, checks and vertex order
+    L_dev is the mean absolute deviation of the distances from a dual vertex to the zero crossings that it averages.  A
+    small value keeps the vertex inside its polygon and the faces free of folds.  Arguments, checks and vertex order
     (without centers) are those of :func:`reli3d.geometry.surface.extract_surface`.  Gradients reach sdf, deformation,
     alpha and beta, except through distances of 0.  A field without surface gives an empty tensor, whose mean is NaN.
     """
@@ -89,10 +89,10 @@ def sign_entropy(sdf: Tensor) -> Tensor:
     """Binary cross-entropy across sign changes of the grid, a scalar loss that removes floating components.
 
     ``H(sigmoid(a), [b > 0]) + H(sigmoid(b), [a > 0])``, averaged over the grid edges (a, b) with a sign change: each
-    end is pulled towards the sign of the other, so sign changes that no other loss supports vanish.  0, without
-    gradient, if there is no sign change.  sdf: ``(X + 1, Y + 1, Z + 1)`` or with leading batch axes, float32, negative
-    inside, logits.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or values
-    that are not finite.  Source: Munkberg et al. 2022; L_sign of FlexiCubes.
+    end is pulled to the sign of the other, so sign changes that no other loss supports vanish.  0, without gradient, if
+    there is no sign change.  sdf: ``(X + 1, Y + 1, Z + 1)`` or with leading batch axes, float32, negative inside,
+    logits.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or non-finite values.  Source: Munkberg et
+    al. 2022; L_sign of FlexiCubes.
     """
     check("sdf", sdf)
     if sdf.ndim < 3 or min(sdf.shape[-3:]) < 2:

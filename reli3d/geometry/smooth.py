@@ -1,7 +1,7 @@
 """Mesh smoothing with the umbrella operator, which moves every vertex towards the mean of its neighbors.
 
-Neighbors are taken from the welded mesh, so that surfaces do not tear at UV seams or split vertices.  Positions change,
-UV coordinates are kept, and normals and tangents are dropped because they no longer fit.
+Neighbors are taken from the welded mesh, so that surfaces do not tear at UV seams or split vertices.  UV coordinates
+are kept; normals and tangents are dropped because they no longer match the positions.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def taubin_smooth(mesh: Mesh, *, iterations: int = 10, step: float = 0.5, pass_b
 
     The steps are ``step`` and ``mu`` with ``1 / step + 1 / mu = pass_band``; frequencies of the umbrella operator below
     ``pass_band`` are kept or slightly amplified.  step: in (0, 1].  pass_band: in (0, 1 / step), small.  Vertices of
-    open borders are fixed.  Gradients reach the vertices.  Sums over neighbors have a fixed order on a CPU.  Raises
+    open borders are fixed.  Gradients reach the vertices.  On the CPU, neighbors are summed in a fixed order.  Raises
     ValueError for values out of range.  Source: Taubin 1995, A signal processing approach to fair surface design.
     """
     if iterations < 0:

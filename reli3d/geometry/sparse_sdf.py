@@ -1,4 +1,4 @@
-"""Sparse evaluation of a signed field on a grid, only where the surface may pass."""
+"""Sparse evaluation of a signed field on a grid, only where the surface may be."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ INSIDE_DEPTH = 0.2  # a coarse cell (two grid cells a side) with all corners bel
 def sparse_sdf(known: Tensor, near: Tensor, evaluate: Callable[[Tensor], Tensor]) -> Tensor:
     """Field values ``(X, Y, Z)`` equal to a dense evaluation near the surface, and ``-INSIDE_DEPTH`` deep inside.
 
-    known: ``(X, Y, Z)``, at least 3 points a side: the values kept where ``near (X, Y, Z)``, bool, is false and no
-    neighbor has the opposite sign.  evaluate: maps flat point indices ``(N,)`` to field values ``(N,)``.
+    known: ``(X, Y, Z)``, at least 3 points per side; its values are kept where ``near (X, Y, Z)``, bool, is False and
+    no neighbor has the opposite sign.  evaluate: maps flat point indices ``(N,)`` to field values ``(N,)``.
 
     1. Every second point of ``near`` along each axis is evaluated.
     2. The points of ``near`` between them are evaluated, except in coarse cells with all corners below
        ``-INSIDE_DEPTH``.
     3. Neighbors across a sign change are evaluated until all are known.
 
-    A closed cavity that contains no point of step 1 is missed.  No gradient.  Raises ValueError for other shapes,
+    A closed cavity that contains no point of step 1 is missed.  No gradient.  Raises ValueError for a wrong shape,
     TypeError unless ``near`` is bool.
     """
     if known.ndim != 3 or min(known.shape) < 3 or near.shape != known.shape:

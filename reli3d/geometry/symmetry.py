@@ -1,7 +1,7 @@
-"""Vertical mirror plane of an object from its silhouettes, by which each view also shows the other half.
+"""Vertical mirror plane of an object from silhouettes; with it, each view also shows the mirrored half.
 
 If the object is mirror-symmetric, the silhouettes and their mirror images are consistent: the visual hull of both sets
-still covers every silhouette.  Under a wrong plane the mirrored silhouettes carve parts away that some view shows.  The
+still covers every silhouette.  With a wrong plane, the mirrored silhouettes carve away parts that some view shows.  The
 residual is the silhouette coherence of Hernandez, Schmitt and Cipolla 2007, Silhouette Coherence for Camera Calibration
 under Circular Motion, here as a function of a plane.
 """
@@ -48,7 +48,7 @@ class MirrorPlane:
 
     @full_precision
     def mirrored(self, camera: Camera) -> Camera:
-        """Mirrored cameras ``(V,)``: images of the mirrored object are those of ``camera``, flipped left to right."""
+        """Mirrored cameras ``(V,)``: they image the mirrored object as ``camera`` the object, flipped left to right."""
         flip = torch.eye(4, device=camera.c2w.device, dtype=torch.float32)
         flip[:3, :3] -= 2.0 * torch.outer(self.normal, self.normal)
         flip[:3, 3] = 2.0 * self.offset * self.normal
@@ -64,10 +64,10 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     """Vertical mirror plane of the object in V views, or None if there is none or it is ambiguous.
 
     distance: ``(V, H, W)`` from :func:`~reli3d.geometry.hull.mask_distance`, of silhouettes that do not touch the image
-    border.  camera: of these views, in any frame and unit.  None for one or two views; for cameras that are rolled, at
-    one position or all on one side; if no plane is consistent with the silhouettes; and if many are, unless nearly all
-    are (a solid of revolution).  Asymmetry that no silhouette shows is not detected.  No gradient.  Raises TypeError
-    for a wrong dtype, ValueError for a wrong shape or device.
+    border.  camera: a batch of these views, in any frame and unit.  None for one or two views; for cameras that are
+    rolled, at one position or all on one side; if no plane is consistent with the silhouettes; and if many are, unless
+    nearly all are (a solid of revolution).  Asymmetry invisible in the silhouettes is not detected.  No gradient.
+    Raises TypeError for a wrong dtype, ValueError for a wrong shape or device.
     """
     check("distance", distance)
     check_camera(camera, like=distance, views=len(distance), size=distance.shape[1:])

@@ -1,7 +1,7 @@
 """Tangent frames of a mesh with UV, and normal maps in these frames.
 
 The convention is MikkTSpace's, as in glTF.  The tangent points along +u.  The bitangent, w * cross(normal, tangent),
-points along -v, up on the image; w is +1 where the texture is not mirrored.  A normal map holds n * 0.5 + 0.5, red
+points along -v, up in the image; w is +1 where the texture is not mirrored.  A normal map stores n * 0.5 + 0.5, red
 along the tangent and green along the bitangent.
 """
 
@@ -37,9 +37,9 @@ def vertex_tangents(vertices: Tensor, faces: Tensor, normals: Tensor, uv: Tensor
     The tangent of a vertex is the sum over its corners of the face's +u direction, projected onto the plane of the
     vertex normal and normalized, times the angle of the corner.  Vertices with equal position, normal and UV are
     merged.  A vertex between mirrored and unmirrored faces, which MikkTSpace splits, takes the side with the larger
-    angle; :func:`unwrap` produces none.  Where all faces have zero UV area the tangent is an arbitrary vector
-    orthogonal to the normal.  No gradient.  Source: Mikkelsen 2008,
-    Simulation of wrinkled surfaces revisited; mikktspace.c.
+    angle; :func:`unwrap` produces none.  Where all faces have zero UV area, the tangent is an arbitrary vector
+    orthogonal to the normal.  No gradient.  Source: Mikkelsen 2008, Simulation of wrinkled surfaces revisited;
+    mikktspace.c.
     """
     vertices, normals, uv = (x.detach().contiguous() for x in (vertices, normals, uv))
     first, label = weld_rows(torch.cat([vertices, normals, uv], 1).cpu().numpy())
@@ -77,7 +77,7 @@ def _frame(normal: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
-    """Normal map values ``(..., 3)`` in [0, 1] of the unit world-space normals ``world (..., 3)``.
+    """Encodes unit world-space normals ``world (..., 3)`` as normal map values ``(..., 3)`` in [0, 1].
 
     normal: ``(..., 3)`` unit, tangent: ``(..., 4)`` with unit direction, both interpolated at the texel.  The frame is
     inverted, not transposed, because interpolated tangents are not exactly orthogonal and :func:`decode_normals` must
@@ -94,7 +94,7 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
 
 
 def decode_normals(encoded: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
-    """Unit world-space normals ``(..., 3)`` of normal map values ``(..., 3)``: inverse of :func:`encode_normals`."""
+    """Decodes normal map values ``(..., 3)`` to unit world-space normals; inverse of :func:`encode_normals`."""
     _check_frame(normal, tangent)
     check("encoded", encoded, last=3, like=normal)
     t, b, n = _frame(normal, tangent)

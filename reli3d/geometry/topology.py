@@ -22,17 +22,17 @@ class Edges:
 
     tail: np.ndarray  # (3 F,) int64, first vertex of each half-edge
     head: np.ndarray  # (3 F,) int64, second vertex
-    order: np.ndarray  # (3 F,) int64, half-edges sorted by edge; those of one edge ascend
+    order: np.ndarray  # (3 F,) int64, half-edges sorted by edge, ascending within an edge
     start: np.ndarray  # (E,) where in ``order`` each edge begins
     valence: np.ndarray  # (E,) half-edges of each edge
 
     def of_valence(self, count: int) -> np.ndarray:
-        """Half-edges ``(count, N)`` of the N edges that have ``count`` of them; ascending along the first axis."""
+        """Half-edges ``(count, N)`` of the N edges with ``count`` half-edges, ascending along the first axis."""
         return self.order[self.start[self.valence == count] + np.arange(count)[:, None]]
 
 
 def group(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``(order, first)``: stable order that sorts ``keys`` >= 0, and where in it each run of equal keys begins."""
+    """``(order, first)``: stable order that sorts ``keys`` >= 0, and the start of each run of equal keys in it."""
     n = len(keys)
     low = max(1, int(n - 1).bit_length())
     # sorting key and index as one number: 5 times faster than argsort
@@ -54,7 +54,7 @@ def edges_of(faces: np.ndarray) -> Edges:
 
 
 def face_neighbors(faces: np.ndarray) -> np.ndarray:
-    """Face across each edge, ``(F, 3)`` int32: -1 where the edge has not exactly two different faces."""
+    """Face across each edge, ``(F, 3)`` int32; -1 unless the edge has exactly two different faces."""
     one, other = edges_of(faces).of_valence(2)
     two = one // 3 != other // 3
     across = np.full(faces.size, -1, np.int32)
@@ -65,7 +65,7 @@ def face_neighbors(faces: np.ndarray) -> np.ndarray:
 def graph_components(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
     """Lowest node ``(count,)`` int32 of the component of every node.
 
-    a, b: ``(L,)`` integers in [0, count), the nodes that each link joins.  Raises ValueError for other numbers.
+    a, b: ``(L,)`` integers in [0, count), the nodes joined by each link.  Raises ValueError for values out of range.
     """
     if a.shape != b.shape or a.ndim != 1:
         raise ValueError(f"b: expected shape (L,) as a, got {a.shape} and {b.shape}")
@@ -78,7 +78,7 @@ def graph_components(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
 
 
 def weld_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index of the first of each set of equal rows of ``rows (N, K)`` float32 and the set ``(N,)`` of every row."""
+    """First index of each set of equal rows in ``rows (N, K)`` float32, and the set ``(N,)`` of every row."""
     bits = np.ascontiguousarray(rows + np.float32(0.0)).view(np.uint32).astype(np.uint64)
     key = np.zeros(len(bits), np.uint64)
     for k in range(bits.shape[1]):  # 64-bit mix (splitmix64): one integer to sort instead of the columns

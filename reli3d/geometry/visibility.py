@@ -17,11 +17,11 @@ MIN_COSINE = 0.05  # between normal and view direction: below it a pixel covers 
 def visible_from(
     scene: RayScene, position: Tensor, normal: Tensor, camera: Camera, active: Tensor | None = None
 ) -> Tensor:
-    """``(N, V)`` bool, true where the point faces the camera, projects into its image and is not occluded.
+    """``(N, V)`` bool: whether each point faces the camera, projects into the image and is not occluded.
 
-    position, normal: ``(N, 3)`` world, the normal unit.  camera: of V views.  active: ``(N, V)`` bool, the pairs to
-    test; all others are False.  No gradient.  Raises TypeError for a wrong dtype, ValueError for a
-    wrong shape or device.
+    position, normal: ``(N, 3)`` world, normals unit.  camera: a batch of V views.  active: ``(N, V)`` bool, the pairs
+    to test; all others are False.  No gradient.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or
+    device.
     """
     check("position", position, last=3)
     check("normal", normal, last=3, like=position)

@@ -1,6 +1,6 @@
-"""OpenEXR images in, through the OpenEXR package.
+"""Reads OpenEXR images with the OpenEXR package.
 
-Reads one flat part of scanlines or of single-level tiles, with channels R, G, B, or Y as gray.  Deep, multi-part,
+Supported: one flat part of scanlines or single-level tiles, with channels R, G, B, or Y as gray.  Deep, multi-part,
 multi-level and luminance-chroma files are errors.  Source: https://openexr.com/en/latest/TechnicalIntroduction.html.
 """
 
@@ -42,7 +42,7 @@ _PRIMARIES = {  # of colorInteropID (Color Interop Forum) without chromaticities
 
 
 def read_exr(path: str | os.PathLike, max_pixels: int, notes: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Pixels ``(H, W, 3)`` float32 of the display window, and the 3x3 matrix that takes them to Rec. 709 (None: none).
+    """Pixels ``(H, W, 3)`` float32 of the display window, and the 3x3 matrix from their primaries to Rec. 709, or None.
 
     Outside the data window the image is black; pixels outside the display window are cropped.  Both are appended to
     ``notes``.  Raises InputError.

@@ -13,7 +13,7 @@ __all__ = ["InputError", "file_size", "printable", "read_bytes", "replacing", "s
 
 
 def read_bytes(path: str | os.PathLike, limit: int) -> bytes:
-    """Content of a regular file of at most ``limit`` bytes.  Raises InputError otherwise; a pipe never blocks."""
+    """Content of a regular file of at most ``limit`` bytes, else InputError; never blocks on a pipe."""
     size = file_size(path)
     if size > limit:
         raise InputError(path, f"expected at most {limit} bytes, got {size}; give a smaller file")
@@ -39,14 +39,14 @@ def file_size(path: str | os.PathLike) -> int:
 
 
 def write_bytes(path: str | os.PathLike, data: bytes) -> None:
-    """Write a file atomically: a temporary file in the same folder, then a rename.  Raises OSError."""
+    """Writes a file atomically: a temporary file in the same folder, then a rename.  Raises OSError."""
     with replacing(path) as temporary:
         temporary.write_bytes(data)
 
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike):
-    """Yield a temporary path in the folder of ``path``; it replaces ``path`` when the block ends without an error."""
+    """Yields a temporary path in the folder of ``path``; it replaces ``path`` if the block ends without an error."""
     path = Path(path)
     temporary = path.with_name(
         f".{os.getpid()}.{os.urandom(4).hex()}{path.suffix[-8:]}"

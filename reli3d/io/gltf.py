@@ -1,7 +1,7 @@
-"""GLB in: the container, accessors, nodes and skins of any glTF 2.0 file, checked before use.
+"""Reads GLB: the container, accessors, nodes and skins of any glTF 2.0 file, checked before use.
 
-Nothing outside the file is opened (data URIs only).  Sizes are limited before memory is taken.  Every fault is an
-InputError that names the field; an omission is a note.  Primitives are read in ``gltf_parts.py``, materials in
+Nothing outside the file is opened (data URIs only).  Sizes are checked before memory is allocated.  Every fault is an
+InputError that names the field; every omission is a note.  Primitives are read in ``gltf_parts.py``, materials in
 ``gltf_materials.py``.  Source: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html.
 """
 
@@ -83,17 +83,17 @@ class Document:
         self._buffers: dict[int, bytes] = {}
 
     def note(self, text: str) -> None:
-        """Append a note on the file, once."""
+        """Appends a note on the file, once."""
         line = f"{printable(os.path.basename(self.path))}: {printable(text)}"
         if line not in self.notes:
             self.notes.append(line)
 
     def leave_out(self, what: str) -> None:
-        """Note that ``what`` is not in the result."""
+        """Adds a note that ``what`` is not in the result."""
         self.note(f"{what[:80]} is left out")
 
     def extensions(self, node: dict, field: str, *quiet: str) -> dict:
-        """Extensions of ``node``; a note reports those that are left out: neither supported nor in ``quiet``."""
+        """Extensions of ``node``; ignored ones (neither supported nor in ``quiet``) are reported in a note."""
         found = self.get(node, "extensions", dict, f"{field}.extensions", {})
         for name in found:
             if name not in SUPPORTED and name not in quiet:
@@ -101,11 +101,11 @@ class Document:
         return found
 
     def fail(self, field: str, expected: str, got: object, fix: str = "export the file again") -> NoReturn:
-        """Raise the InputError of ``field``."""
+        """Raises the InputError of ``field``."""
         raise InputError(self.path, f"{field}: {expected}, got {shown(got)}; {fix}")
 
     def get(self, node: dict, key: str, kind: type, field: str, default=None):
-        """``node[key]`` of the given kind (an int is a float too, a bool is neither), or ``default`` if not None."""
+        """``node[key]`` of type ``kind`` (an int is a float too, a bool is neither), or ``default`` if not None."""
         value = node.get(key, default)
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             try:
@@ -121,7 +121,7 @@ class Document:
         return value
 
     def item(self, kind: str, index: object, field: str) -> dict:
-        """Element ``index`` of the top-level list ``kind``; ``field``: the reference to it, for error messages."""
+        """Element ``index`` of the top-level list ``kind``; ``field``: where it is referenced, for error messages."""
         items = self.get(self.json, kind, list, kind, [])
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(items):
             self.fail(field, f"expected an index into {len(items)} {kind}", index)
@@ -286,7 +286,7 @@ class Document:
         return np.stack([index[k], index[k + 1 + k % 2], index[k + 2 - k % 2]], 1)
 
     def placed_meshes(self) -> list[Placed]:
-        """The mesh of every visible node of the scene that has one."""
+        """The meshes of all visible nodes of the scene."""
         scenes = self.get(self.json, "scenes", list, "scenes", [])
         nodes = self.get(self.json, "nodes", list, "nodes", [])
         if scenes:

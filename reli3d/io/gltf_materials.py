@@ -1,4 +1,4 @@
-"""GLB in: materials as texture sets; see ``gltf.py`` for the container."""
+"""Reads GLB materials as texture sets; see ``gltf.py`` for the container."""
 
 from __future__ import annotations
 
@@ -79,9 +79,9 @@ class Materials:
     def textures(
         self, index: object, field: str, coordinates: Callable[[int], np.ndarray | None]
     ) -> tuple[TextureSet, np.ndarray | None]:
-        """Texture set of a material and the texture coordinates that belong to it, None without textures.
+        """Texture set of a material and its texture coordinates ``(N, 2)``, None without textures.
 
-        coordinates: gives a set ``(N, 2)`` of texture coordinates of the primitive.
+        coordinates: maps a set index to texture coordinates ``(N, 2)`` of the primitive, or None.
         """
         entry = {} if index is None else self.document.item("materials", index, field)
         if index not in self.parsed:
@@ -292,7 +292,8 @@ class Materials:
 def metallic_from_specular(diffuse: Tensor, specular: Tensor) -> tuple[Tensor, Tensor]:
     """Base color ``(..., 3)`` and metallic ``(...)`` whose reflectances are closest to ``diffuse`` and ``specular``.
 
-    Both ``(..., 3)``, linear.  Source: Khronos, KHR_materials_pbrSpecularGlossiness, its example of a conversion.
+    diffuse, specular: ``(..., 3)``, linear.  Source: conversion example of Khronos'
+    KHR_materials_pbrSpecularGlossiness.
     """
     weights = diffuse.new_tensor([0.299, 0.587, 0.114])
     d, s = ((v * v * weights).sum(-1).sqrt() for v in (diffuse, specular))  # perceived brightness

@@ -1,4 +1,4 @@
-"""GLB in: primitives at rest as assets; see ``gltf.py`` for the container."""
+"""Reads GLB primitives, at rest, as assets; see ``gltf.py`` for the container."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def read_parts(
 ) -> list[Asset]:
     """See :func:`reli3d.io.glb.read_glb`.
 
-    max_bytes: of the file.  max_vertices: in all meshes as placed.  max_pixels: of all images together.
+    max_bytes: size of the file.  max_vertices: in all placed meshes together.  max_pixels: in all images together.
     """
     document = Document(path, max_bytes=max_bytes, max_vertices=max_vertices)
     materials = Materials(document, max_pixels)
@@ -61,8 +61,8 @@ def read_parts(
 def has_material_maps(path: str | os.PathLike) -> bool:
     """Whether a material of the file has a metallic-roughness texture.
 
-    Without one its roughness and metallic are two numbers, which exporters write as defaults.  Raises
-    InputError as :func:`read_parts` does.
+    Without one, roughness and metallic are two numbers, which exporters write as defaults.  Raises InputError as
+    :func:`read_parts` does.
     """
     document = Document(path, max_bytes=1 << 29, max_vertices=20_000_000)
     for k in range(len(document.get(document.json, "materials", list, "materials", []))):

@@ -1,7 +1,7 @@
 """Environment maps and other linear images, in OpenEXR (``exr.py``) or Radiance RGBE (``rgbe.py``).
 
 Pixels are linear Rec. 709 radiance.  The upper edge of an environment is +Y, the horizontal center +X, and +Z is right
-of it, in files and in memory: the convention of three.js, model-viewer and Blender.
+of the center, in files and in memory: the convention of three.js, model-viewer and Blender.
 
 Writing raises an error for NaN and negative values; infinity and, in half precision, values above 65504 are clamped to
 65504.  Reading raises an error for NaN, sets negative values to 0 and infinity to 65504.
@@ -30,9 +30,9 @@ MAX_PIXELS = 1 << 25  # 8192 x 4096
 def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None) -> Environment:
     """Reads a lat-long environment ``(H, 2H, 3)``, linear radiance, from an ``.hdr`` or ``.exr`` file.
 
-    The format is detected by content.  The upper edge is +Y, the horizontal center +X, and +Z is right of it.  notes:
-    receives one line for every conversion, clamping or ignored header field.  Raises InputError for a broken file, NaN,
-    a shape other than 2:1, or more than 8192 x 4096 pixels.
+    The format is detected from the content.  The upper edge is +Y, the horizontal center +X, and +Z is right of the
+    center.  notes: receives one line for every conversion, clamping or ignored header field.  Raises InputError for a
+    broken file, NaN, a shape other than 2:1, or more than 8192 x 4096 pixels.
 
     >>> light = reli3d.read_environment("studio.hdr").rotated(math.pi / 2)
     >>> image = reli3d.render_asset(asset, camera, light)
@@ -47,9 +47,9 @@ def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None)
 def write_environment(path: str | os.PathLike, environment: Environment) -> int:
     """Writes ``environment (H, 2H, 3)`` as ``.exr`` (half precision) or ``.hdr`` (RGBE), by the suffix of ``path``.
 
-    Returns the number of values that were clamped to the largest of the format (65504 in ``.exr``).  The file is
-    written completely or not at all.  Raises TypeError for a wrong type; ValueError for NaN, negative values, another
-    shape or suffix; OSError if writing fails.
+    Returns the number of values that were clamped to the format's maximum (65504 in ``.exr``).  The file is written
+    completely or not at all.  Raises TypeError for a wrong type; ValueError for NaN, negative values, a wrong shape or
+    an unknown suffix; OSError if writing fails.
 
     >>> reli3d.write_environment("light.exr", asset.environment)
     >>> again = reli3d.read_environment("light.exr")
@@ -65,16 +65,16 @@ def write_environment(path: str | os.PathLike, environment: Environment) -> int:
 
 
 def environment_bytes(radiance: Tensor) -> bytes:
-    """The ``.hdr`` file of ``radiance (H, 2H, 3)`` as bytes; errors as in :func:`write_environment`."""
+    """Bytes of an ``.hdr`` file with ``radiance (H, 2H, 3)``; errors as in :func:`write_environment`."""
     pixels, _ = _writable(radiance, float(np.finfo(np.float32).max) / 2)
     return rgbe_bytes(pixels)
 
 
 def read_hdr_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> Tensor:
-    """Linear Rec. 709 image ``(H, W, 3)``, float32, finite and not negative, of a ``.hdr`` or ``.exr`` file.
+    """Reads a linear Rec. 709 image ``(H, W, 3)``, float32, finite and not negative, from an ``.hdr`` or ``.exr`` file.
 
-    An OpenEXR file gives its display window, black outside its data.  Colors of other primaries are converted.
-    ``notes`` and errors as :func:`read_environment`.
+    For OpenEXR, the image is the display window, black outside the data window.  Colors in other primaries are
+    converted.  ``notes`` and errors as in :func:`read_environment`.
     """
     file_size(path)  # raises for a pipe, which would block
     try:
@@ -103,11 +103,10 @@ def read_hdr_image(path: str | os.PathLike, *, notes: list[str] | None = None) -
 
 
 def write_exr(path: str | os.PathLike, image: Tensor, *, half: bool = True) -> int:
-    """Write ``image`` as OpenEXR with ZIP compression, in half or float; the whole file or nothing.
+    """Writes ``image`` as OpenEXR with ZIP compression, in half or float, completely or not at all.
 
-    image: ``(H, W)`` luminance Y, ``(H, W, 3)`` RGB or ``(H, W, 4)`` RGBA, premultiplied by alpha.
-    Returns the number of values clamped to 65504.  Raises ValueError on NaN or negative values, OSError where it cannot
-    be written.
+    image: ``(H, W)`` luminance Y, ``(H, W, 3)`` RGB or ``(H, W, 4)`` RGBA, premultiplied by alpha.  Returns the number
+    of values clamped to 65504.  Raises ValueError for NaN or negative values, OSError if writing fails.
     """
     pixels, clamped = _writable(image, HALF_MAX if half else float(np.finfo(np.float32).max), layouts=((), (3,), (4,)))
     name = "Y" if pixels.ndim == 2 else "RGBA"[: pixels.shape[2]]
@@ -120,10 +119,11 @@ def write_exr(path: str | os.PathLike, image: Tensor, *, half: bool = True) -> i
 
 
 def write_hdr(path: str | os.PathLike, image: Tensor) -> int:
-    """Write ``image`` ``(H, W, 3)`` as Radiance RGBE with run lengths; the whole file or nothing.
+    """Writes ``image (H, W, 3)`` as run-length-encoded Radiance RGBE, completely or not at all.
 
-    A pixel keeps its largest channel to 1/256 and the others to the same absolute error.  Returns the number of values
-    clamped to 65504.  Raises ValueError on NaN or negative values, OSError where it cannot be written.
+    The relative error of a pixel's largest channel is at most 1/256; the other channels have the same absolute error.
+    Returns the number of values clamped to 65504.  Raises ValueError for NaN or negative values, OSError if writing
+    fails.
     """
     pixels, clamped = _writable(image, float(np.finfo(np.float32).max) / 2)
     write_bytes(path, rgbe_bytes(pixels))

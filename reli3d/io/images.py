@@ -1,8 +1,8 @@
-"""Reads images and masks, writes PNG, OpenEXR and Radiance HDR images.
+"""Reads images and masks; writes PNG, OpenEXR and Radiance HDR images.
 
-Color is sRGB in [0, 1] as stored; alpha is straight (not premultiplied), and the color under alpha 0 is kept.  Pixels
-are used as stored: an EXIF orientation is reported in a note and not applied, because calibrated cameras refer to the
-stored pixels, unless the size in the camera file shows that they refer to the turned ones.
+Color is sRGB in [0, 1] as stored; alpha is straight (not premultiplied), and color where alpha is 0 is kept.  EXIF
+orientation is reported in a note but not applied, because calibrated cameras refer to the stored pixels, unless the
+image size in the camera file fits only the rotated image.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tu
 
 
 def color_of(bitmap: Image.Image) -> Tensor:
-    """Color ``(H, W, 3)`` in [0, 1] of an image of :func:`decode_image`."""
+    """Color ``(H, W, 3)`` in [0, 1] of an image from :func:`decode_image`."""
     values = unit(bitmap)
     return torch.from_numpy(np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values)
 
@@ -80,10 +80,10 @@ def decode_image(
 ) -> Image.Image:
     """Decodes an image to mode RGB, RGBA, L, or F for 16-bit gray in [0, 65535].
 
-    Reads PNG, JPEG, WebP or TIFF: 8-bit color, palette, gray, CMYK, 16-bit gray; 16-bit color is reduced to 8 bit.  The
-    size is checked before decoding.  notes: receives changes of the pixels.  calibrated: width and height in the camera
-    file; the EXIF orientation is applied if only the rotated image has that aspect.  Raises InputError for other
-    formats, more than 64 MP, several frames, or a broken file.
+    Reads PNG, JPEG, WebP or TIFF: 8-bit color, palette, gray, CMYK, 16-bit gray; 16-bit color is reduced to 8 bits.
+    The size is checked before decoding.  notes: receives changes of the pixels.  calibrated: width and height in the
+    camera file; the EXIF orientation is applied if only the rotated image has this aspect ratio.  Raises InputError for
+    other formats, more than 64 MP, several frames, or a broken file.
     """
     size = file_size(path)
     if size > MAX_BYTES:
@@ -181,7 +181,7 @@ def png_bytes(pixels: Tensor | np.ndarray) -> bytes:
 
 
 def write_png(path: str | os.PathLike, pixels: Tensor | np.ndarray) -> None:
-    """Write :func:`png_bytes` of ``pixels``: the whole file or nothing.  Raises OSError where it cannot be written."""
+    """Writes :func:`png_bytes` of ``pixels``, completely or not at all.  Raises OSError if writing fails."""
     write_bytes(path, png_bytes(pixels))
 
 
@@ -190,9 +190,9 @@ def write_image(path: str | os.PathLike, image: Tensor) -> None:
 
     image: float32, linear Rec. 709, ``(H, W)`` gray, ``(H, W, 3)``, or ``(H, W, 4)`` with color premultiplied by alpha.
     ``.png``: color is divided by alpha, encoded as sRGB and clamped to [0, 1]; alpha is straight.  ``.exr``: values
-    unchanged, premultiplied.  ``.hdr``: ``(H, W, 3)`` only.  A rendering with ``background="environment"`` is written
-    by its ``radiance``, not ``rgba``.  The file is written completely or not at all.  Raises TypeError for another
-    dtype; ValueError for another suffix or shape, NaN, infinity or negative values; OSError if writing fails.
+    unchanged, premultiplied.  ``.hdr``: ``(H, W, 3)`` only.  For a rendering with ``background="environment"``, pass
+    ``radiance``, not ``rgba``.  The file is written completely or not at all.  Raises TypeError for a wrong dtype;
+    ValueError for an unknown suffix, a wrong shape, NaN, infinity or negative values; OSError if writing fails.
 
     >>> image = reli3d.render_asset(asset, camera, light)
     >>> reli3d.write_image("image.png", image.rgba)

@@ -1,8 +1,8 @@
-"""Wavefront OBJ out, with the metallic-roughness words that Blender and others read from a material file.
+"""Writes Wavefront OBJ, with the metallic-roughness keywords that Blender and others read from a material file.
 
-The words ``map_Pr``, ``map_Pm`` and ``norm`` are those of the PBR extension
-(http://exocortex.com/blog/extending_wavefront_mtl_to_support_pbr). ``Ks 0.5`` is what Blender writes and reads for a
-dielectric of refractive index 1.5; without it nothing shines there.
+The keywords ``map_Pr``, ``map_Pm`` and ``norm`` are from the PBR extension
+(http://exocortex.com/blog/extending_wavefront_mtl_to_support_pbr).  Blender writes and reads ``Ks 0.5`` for a
+dielectric of refractive index 1.5; without it, Blender shows no specular reflection.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ norm {name}_normal.png
 def obj_files(asset: Asset, name: str) -> dict[str, bytes]:
     """Files by name: ``NAME.obj``, ``NAME.mtl`` and four PNG textures.
 
-    A corner uses one index for position, normal and texture coordinate.  v is flipped, since it points up in OBJ.
+    A corner uses one index for position, normal and texture coordinate.  v is flipped because it points up in OBJ.
     Raises TypeError or ValueError as :func:`reli3d.write_glb`, and ValueError for vertex colors or UV outside [0, 1]
     that do not repeat.
     """

@@ -20,10 +20,11 @@ RLE_WIDTHS = range(8, 32768)  # lengths of scanlines that may have the run lengt
 
 
 def read_rgbe(path: str | os.PathLike, max_pixels: int, notes: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Pixels ``(H, W, 3)`` float32, top row first, and the 3x3 matrix that takes them to Rec. 709 (None: none).
+    """Pixels ``(H, W, 3)`` float32, top row first, and the 3x3 matrix from their primaries to Rec. 709, or None.
 
-    Flat pixels, the run lengths of 1991 and those before; all eight orientations; EXPOSURE and COLORCORR are divided
-    out; PRIMARIES give the matrix; without them colors are Rec. 709.  Raises InputError, also for ``32-bit_rle_xyze``.
+    Supported: flat pixels, run-length encoding of 1991 and earlier, all eight orientations.  EXPOSURE and COLORCORR are
+    divided out.  PRIMARIES give the matrix; without PRIMARIES, colors are Rec. 709.  Raises InputError, also for
+    ``32-bit_rle_xyze``.
     """
     data = read_bytes(path, MAX_BYTES)
     if data[:2] != b"#?":

@@ -1,4 +1,4 @@
-"""USDZ out, by Pixar's USD library (``usd-core``), an optional install: one mesh with a UsdPreviewSurface."""
+"""Writes USDZ with Pixar's USD library (``usd-core``), an optional dependency: one mesh with a UsdPreviewSurface."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from reli3d.render.asset import Asset
 
 
 def usdz_bytes(asset: Asset) -> bytes:
-    """A USDZ package: +Y up, meters, textures as PNG.  Raises ImportError without ``usd-core``, else as glTF does.
+    """A USDZ package: +Y up, meters, textures as PNG.  Raises ImportError without ``usd-core``, otherwise as glTF.
 
-    Roughness and metallic are channels of one texture, as in glTF; texture coordinates have v up, as USD has them.
+    Roughness and metallic are channels of one texture, as in glTF; texture coordinates have v up, as in USD.
     """
     check_asset(asset)
     if not portable(asset):

@@ -1,6 +1,6 @@
-"""A folder of posed photographs -> Views.
+"""Reads a folder of posed photographs as :class:`~reli3d.views.views.Views`.
 
-Read are ``transforms.json`` (object folders as published, Blender, nerfstudio, instant-ngp), NeRF-synthetic's
+Supported: ``transforms.json`` (object folders as published, Blender, nerfstudio, instant-ngp), NeRF-synthetic's
 ``transforms_train.json``, a COLMAP model, LLFF's ``poses_bounds.npy`` and IDR's and NeuS's ``cameras_sphere.npz``.  The
 object is separated from the background by the images' alpha, by ``mask_path``, or by files in a folder ``masks``.
 """
@@ -52,16 +52,16 @@ def load_views(
     whole: bool = False,
     remove_background: bool = False,
 ) -> Views:
-    """Reads the images of an object folder with their cameras and masks, in the order of the folder.
+    """Reads the images of an object folder with cameras and masks, in folder order.
 
     folder: with cameras in ``transforms.json`` (also ``transforms_train.json`` and the other splits), a COLMAP model,
-    ``cameras_sphere.npz`` or ``poses_bounds.npy``; :mod:`reli3d.capture` finds missing cameras.  views: number of
-    views, 1 to 16, selected by farthest-point sampling.  first_views: number of views from the beginning.  If neither
-    is given: all views, or 16 selected in the same way if there are more.  every: all views without limit;
-    :meth:`Views.taken` selects 16.  masks: folder of masks; otherwise ``mask_path`` of a frame, alpha, or a folder
-    ``masks`` or ``mask``, in this order.  whole: images of more than two megapixels are scaled to two instead of
-    cropped to the object.  remove_background: segment images without a mask by ``rembg`` (extra ``masks``), which may
-    download its network.
+    ``cameras_sphere.npz`` or ``poses_bounds.npy``; :mod:`reli3d.capture` estimates missing cameras.  views: number of
+    views, 1 to 16, selected by farthest-point sampling.  first_views: number of views, taken from the beginning.  If
+    neither is given: all views, or 16 selected by farthest-point sampling if there are more.  every: read all views,
+    without limit; :meth:`Views.taken` then selects 16.  masks: folder of masks; None: ``mask_path`` of a frame, alpha,
+    or a folder ``masks`` or ``mask``, in this order.  whole: downsample images above two megapixels to two megapixels
+    instead of cropping them to the object.  remove_background: segment images without a mask by ``rembg`` (extra
+    ``masks``), which may download its network.
 
     Cameras far from the world origin are translated by ``-Views.origin``.  Raises InputError with one line that names
     file, field, value and fix.
@@ -262,7 +262,7 @@ def _load(
 def looks_premultiplied(image: np.ndarray, mask: np.ndarray) -> bool:
     """Whether no edge pixel of ``image (H, W, 3)`` is brighter than its alpha, and only black lies outside.
 
-    Of a straight image with a bright object the faint edge pixels are brighter than their alpha.
+    In an image with straight alpha and a bright object, faint edge pixels are brighter than their alpha.
     """
     if (image[::8, ::8].max(-1)[mask[::8, ::8] < 0.02] > 0.02).any():  # a background: the usual case, found in a few
         return False
@@ -338,7 +338,7 @@ def _still_inside(root: Path, path: Path, frame: Frame) -> None:
 def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[str]) -> list[float]:
     """``[fx, fy, cx, cy]`` in pixels of the stored image of ``width`` x ``height``.
 
-    A camera calibrated at another size of the same aspect is scaled, with a note; InputError if the aspects differ.
+    A camera calibrated at another image size is scaled, with a note; raises InputError if the aspect ratios differ.
     """
     sx = sy = 1.0
     if lens.size is not None and lens.size != (width, height):

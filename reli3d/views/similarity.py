@@ -1,4 +1,4 @@
-"""Maps between frames: a rotation, one scale and a translation."""
+"""Similarity transforms between frames: a rotation, one scale and a translation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Similarity:
 
     @staticmethod
     def identity() -> Similarity:
-        """The map that changes nothing."""
+        """The identity transform."""
         return Similarity(
             1.0, torch.eye(3, dtype=torch.float64, device="cpu"), torch.zeros(3, dtype=torch.float64, device="cpu")
         )
@@ -42,27 +42,28 @@ class Similarity:
 
     @full_precision
     def apply(self, points: Tensor) -> Tensor:
-        """Mapped ``points (..., 3)``, in their dtype and on their device.  Gradients reach the points."""
+        """Transformed ``points (..., 3)``, in their dtype and on their device.  Gradients reach the points."""
         return self.scale * points @ self.rotation.to(points).T + self.translation.to(points)
 
     @full_precision
     def inverse(self) -> Similarity:
-        """The map back."""
+        """The inverse transform."""
         return Similarity(1 / self.scale, self.rotation.T, -(self.rotation.T @ self.translation) / self.scale)
 
     def compose(self, first: Similarity) -> Similarity:
-        """``first``, then this map."""
+        """The transform that applies ``first``, then this one."""
         return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.apply(first.translation))
 
     def is_identity(self) -> bool:
-        """Whether the map changes nothing, to the last bit."""
+        """Whether the transform is exactly the identity."""
         same = torch.equal(self.rotation, torch.eye(3, dtype=torch.float64, device="cpu"))
         return self.scale == 1.0 and same and not bool(self.translation.any())
 
 
 def output_frame(up: str) -> Similarity:
-    """The frame of the asset, whose +Y is the axis ``up`` of the input cameras' frame.  Raises InputError on another
-    word.
+    """Transform to the asset frame, whose +Y is the axis ``up`` of the input cameras' frame.
+
+    Raises InputError for an invalid ``up``.
     """
     if up not in UP:
         raise InputError("up", f"expected one of {', '.join(UP)}, got {up}")

@@ -63,12 +63,12 @@ class Views:
     c2w: Tensor
     intrinsics: Tensor
     names: tuple[str, ...]
-    notes: tuple[str, ...] = ()  # changes and assumptions of the reader, one line each
+    notes: tuple[str, ...] = ()  # changes and assumptions made on reading, one line each
     in_folder: int | None = None  # number of views in the folder
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world frame here, in that of the folder
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of this world frame, in the folder's world frame
     lighting: str = "object"  # frame in which the lighting is fixed: object or camera
-    chosen: tuple[int, ...] | None = None  # indices of the views for the network, at most 16, if all were read
-    object_box: tuple[tuple[float, ...], ...] | None = None  # lower and upper corner, where the folder has it
+    chosen: tuple[int, ...] | None = None  # indices of the views for the network (at most 16) if all were read
+    object_box: tuple[tuple[float, ...], ...] | None = None  # lower and upper corner, if the folder has it
 
     def __post_init__(self):
         count = len(self.images)
@@ -94,8 +94,9 @@ class Views:
         return len(self.images)
 
     def select(self, which: int | Sequence[int]) -> Views:
-        """The first ``which`` views, or those of the indices ``which`` in that order.  Raises ValueError if out of
-        range.
+        """The first ``which`` views, or the views with indices ``which`` in this order.
+
+        Raises ValueError for an index out of range.
         """
         indices = list(range(which)) if isinstance(which, int) else list(which)
         if not indices or min(indices) < 0 or max(indices) >= len(self):
@@ -113,13 +114,13 @@ class Views:
         )
 
     def taken(self) -> Views:
-        """The views for the network: those in ``chosen``, or all if it is None."""
+        """The views for the network: the views in ``chosen``, or all views if ``chosen`` is None."""
         return self if self.chosen is None else self.select(self.chosen)
 
     def transformed(self, similarity: Similarity) -> Views:
         """The same images with the cameras transformed by ``similarity``; intrinsics are unchanged.
 
-        The ``object_box``, which has the axes of the old frame, is dropped.
+        ``object_box`` is dropped because it is axis-aligned in the old frame.
         """
         c2w = self.c2w.double()
         rotation = similarity.rotation.to(c2w) @ c2w[:, :3, :3]
@@ -134,10 +135,10 @@ class Views:
     def resampled(self, size: int, *, crop: bool = True, padding: float = 0.08) -> ViewBatch:
         """All views at ``size`` x ``size`` pixels, with the intrinsics of the new pixels.
 
-        crop: cut a square around the mask, with a margin of ``padding`` times its side on each side; it may reach over
-        the border, where the mask is 0 and the color that of the nearest edge.  Otherwise the whole image is stretched
-        to the square.  Pixels are filtered over the area they cover (triangle filter); where the new pixels are
-        smaller, bilinear.  Raises ValueError on a size below 1 or, with ``crop``, an empty mask.
+        crop: crop to a square around the mask, with a margin of ``padding`` times its side on each side; beyond the
+        image border, the mask is 0 and the color is the nearest edge pixel's.  If False, the whole image is stretched
+        to the square.  Downsampling uses a triangle filter over the area of the new pixels, upsampling is bilinear.
+        Raises ValueError for a size below 1 or, with ``crop``, for an empty mask.
         """
         if size < 1:
             raise ValueError(f"size: expected at least 1, got {size}")
@@ -165,7 +166,7 @@ def mask_box(mask: Tensor) -> tuple[int, int, int, int]:
 
 
 def touches_border(mask: Tensor) -> bool:
-    """Whether ``mask (H, W)`` is above one half in a pixel of the image's border: the object may be cut off there."""
+    """Whether ``mask (H, W)`` exceeds one half in a pixel at the image border: the object may be cut off there."""
     return any(bool((line > 0.5).any()) for line in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
 
 
