@@ -1,8 +1,8 @@
-"""Find the light around a known shiny ball from one image of it.
+"""Estimates the lighting around a known shiny ball from one image.
 
 usage: python examples/fit_light.py OUTPUT_FOLDER [--steps 150] [--size 64]
 
-Writes ``found.png`` and ``true.png``, maps with +X in the center, and prints the error of the log radiance.
+Writes ``found.png`` and ``true.png``, maps with +X at the horizontal center, and prints the error of the log radiance.
 """
 
 import argparse
@@ -15,7 +15,7 @@ import reli3d
 parser = argparse.ArgumentParser()
 parser.add_argument("output", type=Path)
 parser.add_argument("--steps", type=int, default=150)
-parser.add_argument("--size", type=int, default=64, help="pixels along a side of the image")
+parser.add_argument("--size", type=int, default=64, help="pixels per side of the image")
 args = parser.parse_args()
 args.output.mkdir(parents=True, exist_ok=True)
 

@@ -1,4 +1,4 @@
-"""Find a surface from the silhouettes and depth images of six views.
+"""Fits a surface to the silhouettes and depth images of six views.
 
 usage: python examples/fit_shape.py OUTPUT_FOLDER [--steps 60] [--size 96]
 
@@ -20,7 +20,7 @@ from reli3d.render.silhouette import antialias
 parser = argparse.ArgumentParser()
 parser.add_argument("output", type=Path)
 parser.add_argument("--steps", type=int, default=60)
-parser.add_argument("--size", type=int, default=96, help="pixels along a side of an image")
+parser.add_argument("--size", type=int, default=96, help="pixels per side of an image")
 args = parser.parse_args()
 args.output.mkdir(parents=True, exist_ok=True)
 

@@ -1,8 +1,8 @@
-"""Find the textures of a known object from eight images under a known light.
+"""Fits the textures of a known object to eight images under known lighting.
 
 usage: python examples/fit_texture.py OUTPUT_FOLDER [--steps 150] [--size 96]
 
-Writes ``found.png`` and ``true.png``, the base color maps, and prints the error of an image from a new side.
+Writes ``found.png`` and ``true.png``, the base color maps, and prints the error of a novel view.
 """
 
 import argparse
@@ -18,7 +18,7 @@ TEXELS, SAMPLES = 64, reli3d.Samples(light=4, bsdf=4, cosine=2)
 parser = argparse.ArgumentParser()
 parser.add_argument("output", type=Path)
 parser.add_argument("--steps", type=int, default=150)
-parser.add_argument("--size", type=int, default=96, help="pixels along a side of an image")
+parser.add_argument("--size", type=int, default=96, help="pixels per side of an image")
 args = parser.parse_args()
 args.output.mkdir(parents=True, exist_ok=True)
 

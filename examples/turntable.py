@@ -1,9 +1,9 @@
-"""Turn an object in front of the camera, then turn another light around it.
+"""Rotates an object in front of the camera, then rotates studio lighting around it.
 
 usage: python examples/turntable.py OUTPUT_FOLDER [--glb FILE] [--frames 12] [--size 256]
 
-Without ``--glb`` the object is reconstructed from the photographs that come with the package.  Writes the frames
-``turn_00.png``, ... and ``light_00.png``, ..., and the animation ``turntable.webp``.
+Without ``--glb``, the object is reconstructed from the bundled photographs.  Writes the frames ``turn_00.png``, ... and
+``light_00.png``, ..., and the animation ``turntable.webp``.
 """
 
 import argparse
@@ -20,7 +20,7 @@ parser = argparse.ArgumentParser()
 parser.add_argument("output", type=Path)
 parser.add_argument("--glb", type=Path)
 parser.add_argument("--frames", type=int, default=12)
-parser.add_argument("--size", type=int, default=256, help="pixels along a side of a frame")
+parser.add_argument("--size", type=int, default=256, help="pixels per side of a frame")
 args = parser.parse_args()
 args.output.mkdir(parents=True, exist_ok=True)
 

@@ -24,7 +24,7 @@ def parser() -> Parser:
     )
     p.add_argument("source", type=Path, help="folder of JPEG, HEIC or PNG photographs, or a video (mp4, mov)")
     p.add_argument("output", type=Path, help="object folder to write, with capture.json and capture.png")
-    p.add_argument("--masks", type=Path, help="folder of masks with the photographs' names, instead of --mask-method")
+    p.add_argument("--masks", type=Path, help="folder of masks named like the photographs, instead of --mask-method")
     p.add_argument(
         "--mask-method",
         choices=("grabcut", "key", "rembg"),
@@ -35,10 +35,10 @@ def parser() -> Parser:
     p.add_argument(
         "--turntable",
         action=argparse.BooleanOptionalAction,
-        help="the object turns in front of a fixed camera (default: detected)",
+        help="the object rotates in front of a fixed camera (default: detected)",
     )
     p.add_argument(
-        "--size", type=float, metavar="MM", help="longest side of the object in millimeters: units are meters"
+        "--size", type=float, metavar="MM", help="longest side of the object in millimeters; units become meters"
     )
     p.add_argument("--infer", action="store_true", help="also reconstruct the asset, in OUTPUT/asset")
     return p

@@ -17,7 +17,7 @@ def parser() -> argparse.ArgumentParser:
     p = Parser(prog="reli3d-eval", description="Evaluate the network on held-out procedural objects.")
     p.add_argument("samples", type=Path, help="folder made by reli3d-data render --held-out test --views 24")
     p.add_argument(
-        "--maps", type=Path, required=True, help=".npz of environment maps that training used, for the baseline"
+        "--maps", type=Path, required=True, help=".npz of the environment maps used in training, for the baseline"
     )
     p.add_argument("--weights", default="small", help="small, or a safetensors file")
     p.add_argument(

@@ -36,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="N",
         help="reduce to at most N triangles, 16 to 10^7, with a new texture atlas (pip install 'reli3d[mesh]')",
     )
-    p.add_argument("--texture-size", type=int, help="texels per side, 64 to 4096 (default: of the GLB)")
+    p.add_argument("--texture-size", type=int, help="texels per side, 64 to 4096 (default: as in the GLB)")
     p.add_argument(
         "--textures",
         choices=("png", "webp"),

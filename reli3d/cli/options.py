@@ -34,7 +34,7 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--texture-size", type=int, default=1024, help="texels per side, 256 to 4096 (default 1024)")
     p.add_argument(
-        "--resolution", type=int, help="cubes per side of the FlexiCubes grid, 16 to 256 (default: of the preset)"
+        "--resolution", type=int, help="cubes per side of the FlexiCubes grid, 16 to 256 (default: set by the preset)"
     )
     p.add_argument(
         "--normalize",
@@ -84,7 +84,7 @@ def parser() -> argparse.ArgumentParser:
     where.add_argument(
         "--ray",
         metavar="ADDRESS",
-        help="process the objects on a cluster of the framework Ray: auto for that of this machine, local to start "
+        help="process the objects on a Ray cluster: auto for the cluster running on this machine, local to start "
         "one, or an address; needs pip install 'reli3d[ray]'",
     )
     p.add_argument("--skip-existing", action="store_true", help="skip objects whose files are complete")
@@ -108,9 +108,7 @@ def add_reading(p: argparse.ArgumentParser) -> None:
         metavar="N",
         help="use N views, 1 to 16, selected by farthest-point sampling; default all, at most 16",
     )
-    p.add_argument(
-        "--masks", type=Path, help="folder of masks with the names of the images, instead of their alpha channel"
-    )
+    p.add_argument("--masks", type=Path, help="folder of masks named like the images, instead of the alpha channel")
     p.add_argument(
         "--remove-background",
         action="store_true",

@@ -52,10 +52,12 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--turn", choices=("camera", "light"), default="camera", help="rotate the camera or the environment")
     p.add_argument("--rotate-light", dest="turn", action="store_const", const="light", help="same as --turn light")
-    p.add_argument("--azimuth", type=float, default=30.0, help="of the first view, degrees from +Z towards +X")
-    p.add_argument("--elevation", type=float, default=20.0, help="degrees above the horizon, -89 to 89")
+    p.add_argument("--azimuth", type=float, default=30.0, help="azimuth of the first view in degrees, from +Z to +X")
+    p.add_argument("--elevation", type=float, default=20.0, help="camera elevation in degrees, -89 to 89")
     p.add_argument("--fov", type=float, default=32.0, help="horizontal field of view in degrees")
-    p.add_argument("--distance", type=float, help="from the center of the object (default: the object fills the view)")
+    p.add_argument(
+        "--distance", type=float, help="camera distance to the object's center (default: the object fills the view)"
+    )
     p.add_argument("--size", type=int, default=512, help="pixels per side (default 512)")
     p.add_argument(
         "--quality",
@@ -69,7 +71,7 @@ def parser() -> argparse.ArgumentParser:
         type=int,
         nargs=3,
         metavar=("ENV", "GGX", "COS"),
-        help="samples per subpixel of the environment, GGX and cosine strategies (default: of --quality)",
+        help="samples per subpixel of the environment, GGX and cosine strategies (default: set by --quality)",
     )
     counts.add_argument(
         "--plan",
@@ -78,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
         help="TOTAL samples per subpixel, divided among the strategies to minimize the noise of the first view "
         "(relative noise; with exr absolute); prints the counts to stderr",
     )
-    p.add_argument("--supersampling", type=int, help="subpixels per side of a pixel (default: of --quality)")
+    p.add_argument("--supersampling", type=int, help="subpixels per side of a pixel (default: set by --quality)")
     p.add_argument(
         "--diffuse-model",
         choices=("conserving", "published"),
@@ -91,17 +93,17 @@ def parser() -> argparse.ArgumentParser:
         "--tone",
         choices=("srgb", "agx", "none"),
         default="srgb",
-        help="display transform of all formats but exr; none: linear values",
+        help="display transform, for all formats but exr; none: linear values",
     )
-    p.add_argument("--exposure", type=float, default=0.0, help="in stops, -32 to 32; of all files but AOVs")
+    p.add_argument("--exposure", type=float, default=0.0, help="in stops, -32 to 32, for all files but AOVs")
     p.add_argument(
         "--aovs",
         action="store_true",
         help="also write EXR files of base color, material (0, roughness, metallic), normal (n / 2 + 1 / 2) and depth "
         "(depth, depth, alpha)",
     )
-    p.add_argument("--no-shadows", action="store_true", help="without visibility of the environment")
-    p.add_argument("--seed", type=int, default=0, help="of the Monte Carlo samples")
+    p.add_argument("--no-shadows", action="store_true", help="do not trace shadow rays")
+    p.add_argument("--seed", type=int, default=0, help="seed of the Monte Carlo samples")
     p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     p.add_argument("--json", action="store_true", help="print one JSON object instead of the file names")
     return p

@@ -18,10 +18,10 @@ def parser() -> argparse.ArgumentParser:
         description="Render objects, reconstruct them from some views, and compare in held-out views.",
     )
     p.add_argument("objects", type=Path, nargs="+", help="GLB files with textures")
-    p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps; the held-out ones are used")
+    p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps; only held-out maps are used")
     p.add_argument("--weights", default="small", help="small, or a safetensors file")
     p.add_argument("--views", type=int, nargs="+", default=(1, 2, 4, 8, 16), help="numbers of input views")
-    p.add_argument("--size", type=int, default=128, help="pixels")
+    p.add_argument("--size", type=int, default=128, help="pixels per side of a view")
     p.add_argument("--hero", choices=("random", "first"), default="random", help="which view is the reference view")
     p.add_argument(
         "--icp", action="store_true", help="align the result to the reference by ICP before comparing geometry"

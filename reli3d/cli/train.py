@@ -83,12 +83,12 @@ def parser() -> argparse.ArgumentParser:
         metavar="N",
         help="roughness and metallic of pixels are distributions over N values (8); default as in the weights",
     )
-    small.add_argument("--maps", type=Path, help="environment maps, .npz: half of the draws are relit under them")
+    small.add_argument("--maps", type=Path, help="environment maps, .npz, under which half of the samples are relit")
     paper = p.add_argument_group("stages of the ReLi3D paper's network, and --image-size of pixels")
     paper.add_argument("--image-size", type=int, help="pixels per side; for stage pixels 64 (default), 128 or 256")
     paper.add_argument("--preset", choices=("tiny", "official"))
     paper.add_argument(
-        "--prior", type=Path, help="checkpoint of stage light_prior: its environment decoder, frozen; adds a loss"
+        "--prior", type=Path, help="checkpoint of stage light_prior; adds a loss with its frozen environment decoder"
     )
     paper.add_argument("--perceptual", choices=("gradients", "lpips"))
     paper.add_argument("--checkpointing", action="store_true", help="recompute the trunk's layers in the backward pass")

@@ -25,7 +25,7 @@ def parser() -> argparse.ArgumentParser:
         epilog="Prints the address; Ctrl-C ends.  The page can also be opened as a file.",
     )
     p.add_argument("folder", type=Path, help=f"folder written by reli3d-infer, with {PAGE}")
-    p.add_argument("--port", type=int, default=0, help="port on 127.0.0.1 (default: a free one)")
+    p.add_argument("--port", type=int, default=0, help="port on 127.0.0.1 (default: any free port)")
     p.add_argument("--no-browser", action="store_true", help="print the address only")
     return p
 
