@@ -19,7 +19,7 @@ def parser() -> Parser:
         prog="reli3d capture",
         description="Find the cameras and the masks of photographs or a video of one object, and write an object "
         "folder that reli3d-infer reads.  Needs the extra: pip install 'reli3d[capture]'.",
-        epilog="Exit code: 0 all checks passed, 2 wrong input, 3 a check failed (the folder is written), 130 "
+        epilog="Exit code: 0 all checks passed, 2 invalid input, 3 a check failed (the folder is written), 130 "
         "interrupted.  The folder's path goes to stdout.",
     )
     p.add_argument("source", type=Path, help="folder of JPEG, HEIC or PNG photographs, or a video (mp4, mov)")

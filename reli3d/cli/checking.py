@@ -24,7 +24,7 @@ def parser() -> Parser:
         prog="reli3d check",
         description="Check the cameras and masks of object folders: print one line per view and a verdict, and draw "
         "the rig with the visual hull.",
-        epilog="Exit code: 0 plausible, 1 some folders failed, 2 wrong input, 3 cameras or masks are implausible.",
+        epilog="Exit code: 0 plausible, 1 some folders failed, 2 invalid input, 3 cameras or masks are implausible.",
     )
     add_reading(p)
     return p

@@ -18,7 +18,7 @@ def parser() -> argparse.ArgumentParser:
     p = Parser(
         prog="reli3d export",
         description="Convert a GLB with one surface to another format.  Prints the names of the written files.",
-        epilog="Exit code: 0 done, 2 wrong input.",
+        epilog="Exit code: 0 done, 2 invalid input.",
     )
     p.add_argument("glb", type=Path, help="a GLB with one surface, such as mesh.glb of a result")
     p.add_argument(

@@ -55,7 +55,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Row:
-    """The outcome of one object.  result: ``done``, ``skipped``, ``refused`` (wrong input) or ``failed``."""
+    """The outcome of one object.  result: ``done``, ``skipped``, ``refused`` (invalid input) or ``failed``."""
 
     object: str
     result: str

@@ -15,8 +15,8 @@ def parser() -> argparse.ArgumentParser:
         prog="reli3d-infer",
         description="Reconstruct a relightable GLB and an HDR environment from a few photographs of an object with "
         "known cameras.",
-        epilog="Exit code: 0 all done, 1 some objects failed, 2 wrong input, 130 interrupted.  Prints the paths of the "
-        "results.",
+        epilog="Exit code: 0 all done, 1 some objects failed, 2 invalid input, 130 interrupted.  Prints the paths of "
+        "the results.",
     )
     add_reading(p)
     p.add_argument(

@@ -24,7 +24,7 @@ def parser() -> argparse.ArgumentParser:
     p = Parser(
         prog="reli3d-render",
         description="Render a GLB with direct lighting and shadows under an HDR environment.",
-        epilog="Exit code: 0 done, 2 wrong input.  Prints the names of the files; progress goes to stderr.",
+        epilog="Exit code: 0 done, 2 invalid input.  Prints the names of the files; progress goes to stderr.",
     )
     p.add_argument("glb", type=Path)
     p.add_argument(

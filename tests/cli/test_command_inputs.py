@@ -1,4 +1,4 @@
-"""``reli3d-render``, ``-data``, ``-train`` and ``-eval`` on wrong input: one line, exit code 2, before any work."""
+"""``reli3d-render``, ``-data``, ``-train`` and ``-eval`` on invalid input: one line, exit code 2, before any work."""
 
 import numpy as np
 import pytest
