@@ -1,6 +1,6 @@
 """Cameras stored as NumPy arrays: LLFF's ``poses_bounds.npy``, IDR's and NeuS's ``cameras_sphere.npz``.
 
-Both belong to images by the order of their file names alone, as in the readers of these formats.
+Both are matched to images only by the order of the file names, as in the reference readers of these formats.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Masks made by a network that separates objects from backgrounds: ``rembg`` (MIT), an optional install.
+"""Foreground masks from a segmentation network: ``rembg`` (MIT), an optional dependency.
 
-rembg fetches its network from its own release page where it is not on the disk yet; nothing here starts that unless
-a user did.
+rembg downloads its network from its release page on first use; this module is used only if the user requests it.
 """
 
 from __future__ import annotations
@@ -18,9 +17,9 @@ NETWORK = "isnet-general-use"  # Qin and others 2022, Highly accurate dichotomou
 
 
 class Remover:
-    """Makes masks, one at a time; the network is loaded with the first.
+    """Segments images, one at a time; the network is loaded with the first image.
 
-    Raises InputError of ``option`` where it cannot be loaded.
+    Raises InputError for ``option`` if the network cannot be loaded.
     """
 
     def __init__(self, option: str = "remove-background"):
@@ -29,7 +28,7 @@ class Remover:
         self._cut_out: Callable[[Image.Image], Image.Image] | None = None
 
     def mask(self, bitmap: Image.Image) -> Image.Image:
-        """Mask of mode L in the size of ``bitmap``, soft at the edge of the foreground."""
+        """Mask of mode L with the size of ``bitmap``, soft at the edge of the foreground."""
         with self._lock:
             if self._cut_out is None:
                 self._cut_out = _loaded(self.network, self.option)

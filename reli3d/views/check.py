@@ -1,7 +1,7 @@
-"""Checks the cameras of views: a report with the likely mistake of wrong conventions, and a plot of the rig.
+"""Checks the cameras of views: a report with the likely mistake in conventions, and a plot of the rig.
 
-With correct cameras the silhouettes of the visual hull fill the masks.  Otherwise the common mistakes are inverted one
-at a time, and the one whose inverse makes the hull fill the masks is named.
+With correct cameras, the silhouettes of the visual hull fill the masks.  Otherwise common mistakes are undone one at a
+time; the report names the mistake whose correction makes the hull fill the masks.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float32
 
 @full_precision
 def explain_cameras(views: Views) -> list[str]:
-    """One line per view, one on the up axis where it is not +Y, and last the :func:`verdict` on the cameras."""
+    """One line per view, one line on the up axis unless it is +Y, and last the :func:`verdict` on the cameras."""
     hull, filled = agreement(views)
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
     rays = center_rays([m.cpu() for m in views.masks], c2w, intrinsics)
@@ -90,7 +90,7 @@ def _triple(values: Tensor) -> str:
 
 @full_precision
 def agreement(views: Views) -> tuple[Hull, list[float]]:
-    """The visual hull and the fraction of each mask that its silhouette fills, all 0 for an empty hull."""
+    """The visual hull, and the fraction of each mask that the hull's silhouette fills; all 0 for an empty hull."""
     hull = visual_hull(views)
     if len(hull.points) == 0:
         return hull, [0.0] * len(views)
@@ -229,10 +229,9 @@ _COLORS = ("#d62728", "#1f77b4", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e
 
 
 def draw_rig(views: Views, path: str | os.PathLike) -> None:
-    """Write a PNG of the rig: frustums, visual hull and the network's cube from two sides, and thumbnails.
+    """Writes a PNG of the rig: frustums, visual hull and the network's cube from two sides, and thumbnails.
 
-    On the thumbnails the mask's outline is green and the hull's cells are red dots.  Raises OSError where ``path``
-    cannot be written.
+    On the thumbnails, the mask's outline is green, and the hull's cells are red dots.  Raises OSError if writing fails.
     """
     hull, filled = agreement(views)
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()

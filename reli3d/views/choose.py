@@ -1,4 +1,4 @@
-"""Selection of views by farthest-point sampling of their cameras."""
+"""View selection by farthest-point sampling of the cameras."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ LOG_DISTANCE_WEIGHT_RAD = 0.5  # radians per factor e of distance: half the dist
 def view_distances(c2w: Tensor) -> tuple[Tensor, Tensor]:
     """Angles [rad] between the views ``(V, V)`` and their distances ``(V, V)``, float64.
 
-    angle: between the directions to the eyes from the point that the cameras look at.  distance: sqrt(angle^2 + (w log
-    r)^2), where r is the ratio of the distances of the eyes to that point and w is ``LOG_DISTANCE_WEIGHT_RAD``.  Roll
-    and lens have no effect.
+    angle: between the directions to the cameras from the point that they look at.  distance: sqrt(angle^2 + (w log
+    r)^2), where r is the ratio of the cameras' distances to this point and w is ``LOG_DISTANCE_WEIGHT_RAD``.  Roll and
+    lens have no effect.
     """
     poses = c2w.double().cpu()
     eyes, axes = poses[:, :3, 3], -poses[:, :3, 2]
@@ -49,8 +49,8 @@ def _looked_at(eyes: Tensor, axes: Tensor) -> Tensor:
 def choose_views(c2w: Tensor, count: int, *, min_distance: float = 0.0) -> list[int]:
     """Selects up to ``count`` views by farthest-point sampling, starting with view 0; returns ascending indices.
 
-    c2w: ``(V, 4, 4)``.  min_distance: distance (:func:`view_distances`) [rad] from the selected views below which no
-    further view is selected.  The covering radius is at most 2 times the optimum (Gonzalez 1985).
+    c2w: ``(V, 4, 4)``.  min_distance: no view closer than this to a selected view is selected ([rad], as in
+    :func:`view_distances`).  The covering radius is at most 2 times the optimum (Gonzalez 1985).
     """
     if not count >= 1:
         raise ValueError(f"count: expected at least 1, got {count}")

@@ -1,8 +1,8 @@
 """Cameras of a COLMAP model, as text (``cameras.txt`` and ``images.txt``) or binary (``cameras.bin``, ``images.bin``).
 
 COLMAP stores world-to-camera rotations (w, x, y, z) and translations in OpenCV axes (+Y down, looking along +Z); they
-become camera-to-world in OpenGL axes here.  Pixel centers lie at +0.5 there as well.
-Source: https://colmap.github.io/format.html and the list of camera models there.
+are converted to camera-to-world in OpenGL axes.  COLMAP's pixel centers are at +0.5 too.  Source:
+https://colmap.github.io/format.html and the list of camera models there.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _MODELS = {
 def find_colmap(folder: Path) -> list[Path]:
     """The ``images.txt`` and ``images.bin`` of the models in ``folder``, each with its cameras in the same folder.
 
-    Of a model in both forms the text, which people edit, comes first.
+    If a model has both, the text file, which users edit, comes first.
     """
     places = [at for place in PLACES for at in (sorted(folder.glob(place)) if place else [folder])]
     found = [
@@ -55,8 +55,8 @@ def find_colmap(folder: Path) -> list[Path]:
 def read_colmap(folder: Path, models: Sequence[Path]) -> tuple[list[Frame], list[str]]:
     """All frames by image name of the model with most images, image files below ``folder``, and notes.
 
-    models: as :func:`find_colmap` gives them; the first of the largest is read.  Images that are missing in the folder
-    are left out with a note.  Raises InputError naming the line, or the entry of a binary file, and the field.
+    models: from :func:`find_colmap`; the first of the largest is read.  Images missing from the folder are omitted,
+    with a note.  Raises InputError naming the line, or the entry of a binary file, and the field.
     """
     notes = ["COLMAP models have no up direction and no scale: the mesh is in the frame of the cameras"]
     entries = [_entries(path) for path in models]

@@ -1,7 +1,7 @@
 """The entries of COLMAP's binary files ``cameras.bin`` and ``images.bin``: little-endian, without alignment.
 
-Source: https://colmap.github.io/format.html#binary-file-format.  Unused data is skipped: the points of an image are
-stepped over.
+Source: https://colmap.github.io/format.html#binary-file-format.  Unused data, such as the points of an image, is
+skipped.
 """
 
 from __future__ import annotations

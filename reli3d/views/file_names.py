@@ -1,4 +1,4 @@
-"""Names of files as users and their programs write them: image endings, upper and lower case."""
+"""File names regardless of case: image suffixes and lookup."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
 
 class FolderIndex:
-    """Names in folders, each listed once: finds files by their names, or else without regard to case."""
+    """Cached folder listings: finds files by exact name, else regardless of case."""
 
     def __init__(self) -> None:
         self._names: dict[str, dict[str, list[str]]] = {}
 
     def find(self, folder: str | os.PathLike, relative: PurePath) -> Path | None:
-        """The path below ``folder``, in which no part is ``..``; None where there is none.
+        """The path below ``folder``, in which no part is ``..``; None if there is none.
 
-        Raises InputError where several differ from ``relative`` in case alone.
+        Raises InputError if several paths differ from ``relative`` only in case.
         """
         at = Path(folder)
         for part in relative.parts:
@@ -50,13 +50,13 @@ def _listed(folder: Path) -> list[str]:
 
 
 def named(folder: Path, names: Sequence[str]) -> list[str]:
-    """Names in ``folder`` that are ``names`` without regard to case, in the order of ``names``."""
+    """Names in ``folder`` equal to ``names`` regardless of case, in the order of ``names``."""
     there = sorted(_listed(folder))
     return [found for name in names for found in there if found.casefold() == name]
 
 
 def images_in(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
-    """The files of ``folder`` with one of ``endings`` in any case, sorted; empty where there is no folder."""
+    """The files of ``folder`` with one of ``endings`` in any case, sorted; empty if the folder does not exist."""
     return sorted(p for p in (folder / name for name in _listed(folder)) if p.suffix.lower() in endings and p.is_file())
 
 

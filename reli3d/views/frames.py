@@ -1,4 +1,4 @@
-"""One frame of a camera file, checked, before its image is read: image file, pose and lens."""
+"""Frames of a camera file, checked before the image is read: image file, pose and lens."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ RADII = 32  # of an image's diagonal at which distortion is evaluated
 class Lens:
     """Either a field of view in radians, or focal lengths in pixels of an image of ``size`` (None: as stored)."""
 
-    fov: tuple[float, float] | None = None  # (x, y); y is NaN where the focal length is that of x
+    fov: tuple[float, float] | None = None  # (x, y); y is NaN if the focal lengths are equal
     focal: tuple[float, float] | None = None
     center: tuple[float, float] | None = None  # None or NaN: the middle
     size: tuple[int, int] | None = None
-    radial: tuple[float, ...] = ()  # k1, k2, ... of OpenCV's polynomial; accepted where it does not matter
+    radial: tuple[float, ...] = ()  # k1, k2, ... of OpenCV's polynomial; accepted if negligible
     tangential: tuple[float, ...] = ()  # p1, p2
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A posed image file.  ``where`` names it in error messages: the camera file and the frame."""
+    """A posed image file.  where: camera file and frame, for error messages."""
 
     where: str
     name: str
@@ -78,7 +78,7 @@ def rigid(where: str, field: str, value: object) -> np.ndarray:
 
 
 def nearest_rigid(where: str, field: str, matrix: np.ndarray) -> np.ndarray:
-    """``matrix`` with the nearest rotation in place of its upper left block.  Raises InputError if that is far."""
+    """``matrix`` with its upper left block replaced by the nearest rotation.  Raises InputError if they differ much."""
     block = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         determinant, gram = float(np.linalg.det(block)), block.T @ block
@@ -122,8 +122,8 @@ def shape_of(value: object) -> str:
 def file_within(root: Path, where: str, field: str, value: object) -> Path:
     """Path of the file that ``value`` names relative to ``root``.  Raises InputError if it leaves ``root``.
 
-    Errors: anything but text, URLs, NUL, absolute paths, and files outside ``root`` (through ``..`` or a link).  The
-    file need not exist.
+    Errors are values that are not text, URLs, NUL, absolute paths, and files outside ``root`` (through ``..`` or a
+    link).  The file need not exist.
     """
     if not isinstance(value, str) or not value.strip():
         raise InputError(where, f"{field}: expected the path of a file, got {shown(value)}; correct the camera file")
@@ -157,7 +157,7 @@ def file_within(root: Path, where: str, field: str, value: object) -> Path:
 
 
 def check_distortion(where: str, lens: Lens, focal: float, width: int, height: int) -> str | None:
-    """A note where ``lens`` has distortion of at most MAX_DISTORTION_PIXELS.  Raises InputError where it has more."""
+    """A note if ``lens`` has distortion of at most MAX_DISTORTION_PIXELS.  Raises InputError for larger distortion."""
     if not any(lens.radial + lens.tangential):
         return None
     try:

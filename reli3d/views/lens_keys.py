@@ -1,6 +1,6 @@
-"""The lens of a frame of ``transforms.json``: the spellings that are read, and keys that are errors.
+"""The lens of a frame of ``transforms.json``: supported keys, and keys that are errors.
 
-Read, in this order, from the frame, else from the file:
+Supported, in this order, from the frame, else from the file:
 
 - a 3x3 matrix in pixels: ``intrinsics``, ``K``, ``intrinsic_matrix``, ``camera_intrinsics``, ``camera_matrix``, ...
 - focal lengths in pixels: ``fl_x``, ``fl_y``, or ``fx``, ``fy``
@@ -9,8 +9,8 @@ Read, in this order, from the frame, else from the file:
 - ``camera_fov``, ``fov_rad`` in radians, one number or two (the published object folders)
 - ``focal_length`` and ``sensor_width`` in the same unit
 
-0.7 radians, as in the ReLi3D release, only where neither the frame nor the file has a key of a lens.  A key that
-resembles one and is none of these is an error, as is a lens that is no pinhole.
+The field of view is 0.7 radians, as in the ReLi3D release, if neither the frame nor the file has a lens key.
+Unsupported keys that resemble lens keys, and lenses other than a pinhole, are errors.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ _OPENCV = re.compile(r".*(opencv|colmap|rdf).*|cv")
 
 
 def check_keys(where: str, values: dict) -> None:
-    """Raises InputError for a key that changes the camera and is not read.  Null, false and 0 change nothing."""
+    """Raises InputError for an unsupported key that changes the camera.  Null, false and 0 change nothing."""
     for key, value in values.items():
         word = _word(key)
         if isinstance(value, str) and _AXES.fullmatch(word) and _OPENCV.fullmatch(value.lower().strip()):
@@ -162,7 +162,7 @@ def _words(value: object) -> bool:
 def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
     """The lens of ``frame`` in a file with the fields ``data``; both have passed :func:`check_keys`.
 
-    Raises InputError naming the field where values are no lens or two spellings disagree.
+    Raises InputError naming the field if the values are not a lens or if two keys disagree.
     """
 
     def found(key: str, low: float = -1e6, high: float = 1e6) -> float | None:

@@ -1,4 +1,4 @@
-"""The error for an input without cameras, with the command that makes them."""
+"""The error for input without cameras, with the command that estimates them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ CAMERA_FILES = ("transforms.json", "transforms_train.json", "sparse", "poses_bou
 
 
 def no_cameras(source: Path) -> InputError:
-    """The error for ``source``, which is no folder with cameras.
+    """The error for ``source``, which is not a folder with cameras.
 
-    Names the exact ``reli3d capture`` for photographs in it, in its ``images`` or in one of its sub-folders, and for a
-    video.
+    Names the exact ``reli3d capture`` command if ``source`` is a video, or has photographs in it, in ``images`` or in a
+    sub-folder.
     """
     if source.suffix.lower() in VIDEOS and source.is_file():
         return _capture(source, source, "a video")

@@ -1,4 +1,4 @@
-"""From the frame of the input cameras to the frame of the network: the coarse visual hull locates the object."""
+"""Transform from the frame of the input cameras to the network's frame, from a coarse visual hull of the object."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ EYE_RESOLUTION = 1e-6  # of an eye's distance from the origin: float32 does not 
 
 @dataclass(frozen=True)
 class Hull:
-    """Cells of a grid that project into every mask; empty where the cameras and masks agree on nothing."""
+    """Grid cells that project into every mask; empty if cameras and masks are inconsistent."""
 
     points: Tensor  # (N, 3) float64 cell centers
     cell: float  # side of a cell
@@ -39,7 +39,7 @@ class Hull:
     extent: float  # longest lateral side of the masks at ``aim``
 
     def box(self) -> tuple[Tensor, Tensor]:
-        """Lower and upper corner ``(3,)``, to half a cell.  ValueError on an empty hull."""
+        """Lower and upper corner ``(3,)``, to half a cell.  Raises InputError for an empty hull."""
         if len(self.points) == 0:
             raise InputError("hull", "expected a point inside all masks, got none; run reli3d check to see the cameras")
         return self.points.amin(0), self.points.amax(0)  # the border runs through the outermost cells
@@ -47,18 +47,18 @@ class Hull:
 
 @full_precision
 def normalize(views: Views, mode: str = "auto") -> Similarity:
-    """The map from the frame of the input cameras to the network's frame (no rotation).
+    """The transform from the frame of the input cameras to the network's frame (no rotation).
 
     mode ``none``: identity.  ``hull``: the bounding box of the visual hull is centered and its longest side scaled to
     1, as in training.  ``auto``: the same with ``views.object_box`` if there is one; else the identity if the visual
     hull lies in the network's cube of half side 0.87, is at least 0.55 long and centered within 0.3 of the origin; else
     ``hull``.
 
-    Captures from one side, all eyes within 90 degrees seen from the object, leave its depth open: it is at most 1.3
-    widths of the masks, where the hull is cut, and the box is aligned with the mean viewing direction, so that the
-    scale does not depend on the frame.  One view (or views from one direction) has no scale: the depth is guessed as
-    the width, at the point of the ray that is nearest to the origin.  Raises InputError where no point lies inside all
-    masks.
+    Captures from one side (all cameras within 90 degrees as seen from the object) do not constrain the depth of the
+    object: the hull is cut at 1.3 times the width of the masks, and the box is aligned with the mean viewing direction,
+    so that the scale does not depend on the frame.  One view (or views from one direction) does not determine scale:
+    the depth is set to the width, at the point of the ray nearest to the origin.  Raises InputError if no point lies
+    inside all masks.
     """
     if mode not in ("auto", "none", "hull"):
         raise ValueError(f"mode: expected auto, none or hull, got {mode!r}")
@@ -102,10 +102,10 @@ def _one_sided_basis(views: Views, hull: Hull) -> Tensor:
 def visual_hull(views: Views) -> Hull:
     """Coarse visual hull of ``views``, on the CPU: a grid where the views meet, refined once to the box of its cells.
 
-    A cell counts where the masks' maximum over its footprint exceeds one half, so that thin parts are not lost; beyond
-    the border of an image the mask has its values at the border.  The hull is limited to the ball that the masks' width
-    suggests, which bounds it along rays that no other view crosses.  Views whose mask touches the border do not count
-    where at least LEAST_WHOLE others are there.
+    A cell is kept if, in every view, the maximum of the mask over the cell's footprint exceeds one half, so that thin
+    parts are not lost; beyond the image border, the mask has its border values.  The hull is clipped to a ball with a
+    diameter derived from the masks' width, which bounds it along rays that no other view crosses.  Views whose mask
+    touches the border are ignored if at least LEAST_WHOLE others remain.
     """
     whole = [i for i, mask in enumerate(views.masks) if not touches_border(mask)]
     if LEAST_WHOLE <= len(whole) < len(views):
@@ -149,9 +149,9 @@ def center_rays(masks: list[Tensor], c2w: Tensor, intrinsics: Tensor) -> Tensor:
 
 @full_precision
 def meeting_point(origins: Tensor, rays: Tensor) -> tuple[Tensor, float]:
-    """The point ``(3,)`` nearest to all rays, and how well they fix it: the smallest mean squared sine, 0 if parallel.
+    """The point ``(3,)`` nearest to all rays, and how well they determine it: least mean squared sine, 0 if parallel.
 
-    Below PARALLEL_AXES_SINE2 it is the point of the mean ray nearest to the origin, or at unit distance if that lies
+    Below PARALLEL_AXES_SINE2, the point of the mean ray nearest to the origin, or at unit distance if that point lies
     behind a camera.
     """
     across = torch.eye(3, dtype=rays.dtype, device=rays.device) - rays[:, :, None] * rays[:, None]
@@ -165,11 +165,11 @@ def meeting_point(origins: Tensor, rays: Tensor) -> tuple[Tensor, float]:
 
 
 def near_origin(c2w: Tensor) -> Tensor:
-    """The point ``(3,)`` float64 that shall be the origin of cameras ``c2w (V, 4, 4)`` float64: where they look, if
-    the origin of their frame is more than FAR_DISTANCES times as far from there as they are; else zero.
+    """New origin ``(3,)`` float64 for cameras ``c2w (V, 4, 4)`` float64.
 
-    Raises InputError where they are nearer to it than MIN_OBJECT_DISTANCE, unless all are one point, as the eyes of a
-    rig about the origin are if its matrices are world-to-camera.
+    The point that the cameras look at, if the origin of their frame is more than FAR_DISTANCES times as far from this
+    point as the cameras are; else zero.  Raises InputError if cameras are nearer to the point than MIN_OBJECT_DISTANCE,
+    unless all positions coincide, as for a rig around the origin with world-to-camera matrices.
     """
     eyes = c2w[:, :3, 3]
     if len(eyes) > 1 and float((eyes - eyes[0]).abs().max()) <= COINCIDENT_EYES * float(eyes.abs().max()):

@@ -1,8 +1,8 @@
-"""Views in the form of the published network's training data, and its further options.
+"""Views preprocessed like the published network's training data, and further options of this network.
 
-The release stores its training views as JPEG and sends every input the same way: a round trip through JPEG, a plain
-bilinear resize, a mask that is cut at one half after it.  The network was trained on such images, so inference
-uses the same steps, which docs/model.md lists.
+The release stores training views as JPEG and preprocesses every input likewise: JPEG round trip, bilinear resize
+without antialiasing, mask thresholded at one half after resizing.  The network was trained on such images, so inference
+uses the same steps, listed in docs/model.md.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ BACKGROUND_RANGE = 4 / 255  # between the 10th and the 90th percentile; a cut-ou
 
 
 def published_views(views: Views, size: int) -> ViewBatch:
-    """All views at ``size`` x ``size`` pixels as the release prepares them; cameras stay as they are.
+    """All views at ``size`` x ``size`` pixels as the release prepares them; cameras are unchanged.
 
     The whole image is stretched to the square; colors keep the background; masks are 0 or 1.  8-bit pixels
     are encoded, so colors of 16 bits are rounded first.  Agrees with the published tensors to float32
-    rounding (2e-7), masks exactly.  Raises ValueError on a size below 1 and for views that are not on the CPU, where
+    rounding (2e-7), masks exactly.  Raises ValueError for a size below 1, or for views that are not on the CPU, where
     the codec runs.
     """
     if size < 1:
@@ -66,9 +66,7 @@ def _resized(pixels: Tensor, size: int) -> Tensor:
 
 
 def hero_first(views: Views, hero: int) -> Views:
-    """``views`` with the one of index ``hero`` first and the rest in their order.  Raises InputError for an index that
-    is none.
-    """
+    """``views`` with view ``hero`` first and the others in order.  Raises InputError for an index out of range."""
     count = len(views)
     if isinstance(hero, bool) or not isinstance(hero, int) or not 0 <= hero < count:
         raise InputError("hero", f"expected 0 to {count - 1} with {count} views, got {hero}")
@@ -87,7 +85,7 @@ def background_shown(views: Views, background: str, *, readable: bool) -> bool:
 
 
 def has_background(image: Tensor, mask: Tensor) -> bool:
-    """Whether ``image (H, W, 3)`` shows something outside ``mask (H, W)``: a cut-out has one flat color there."""
+    """Whether ``image (H, W, 3)`` has content outside ``mask (H, W)``: a cut-out has one flat color there."""
     outside = image[mask < CLEAR]
     if len(outside) == 0:
         return False
@@ -96,7 +94,7 @@ def has_background(image: Tensor, mask: Tensor) -> bool:
 
 
 def placement_notes(views: Views) -> tuple[str, ...]:
-    """The notes for poses that are left as stored: nothing where the object fills the network's cube, else one line."""
+    """Notes on poses that are used as stored: none if the object fills the network's cube, else one line."""
     try:
         placed = normalize(views, "auto").is_identity()
     except InputError:  # masks that do not meet

@@ -1,4 +1,4 @@
-"""Reduction of large images to the resolution that later stages read."""
+"""Crops and downsamples large images to the resolution that later stages need."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Cut:
     size: tuple[int, int]
 
     def pixels(self, bitmap: Image.Image) -> Image.Image:
-        """The part of ``bitmap`` at the new size, filtered over their area; straight alpha stays straight."""
+        """The part of ``bitmap`` at the new size, area-filtered; straight alpha stays straight."""
         if bitmap.mode == "RGBA":  # Pillow would multiply the color by alpha, and lose that under alpha 0
             return Image.merge("RGBA", [self.pixels(band) for band in bitmap.split()])
         return bitmap.resize(self.size, Image.Resampling.BILINEAR, box=self.part)
@@ -35,9 +35,9 @@ class Cut:
 
 
 def cut(size: tuple[int, int], inside: np.ndarray, *, whole: bool) -> Cut | None:
-    """What to keep of an image of ``size`` (width, height); None where all of it is kept as it is.
+    """Crop and size for an image of ``size`` (width, height); None if the image is kept unchanged.
 
-    inside: ``(H, W)`` bool, the pixels of the object, one at least.  whole: keep the background as well, with fewer
+    inside: ``(H, W)`` bool, the pixels of the object, at least one.  whole: keep the background as well, with fewer
     pixels on the object.
     """
     width, height = size

@@ -1,7 +1,7 @@
 """Cameras of a ``transforms.json``: the published object folders, Blender's NeRF export, nerfstudio and instant-ngp.
 
-All store camera-to-world matrices in OpenGL axes, which are used as they stand; ``applied_transform`` and the like turn
-nothing.  :mod:`reli3d.views.lens_keys` has the spellings of the lens.
+All store camera-to-world matrices in OpenGL axes, which are used as stored; ``applied_transform`` and similar keys are
+not applied.  :mod:`reli3d.views.lens_keys` reads the lens.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAX_FRAMES = 4096  # a video at 30 frames a second for two minutes
 
 
 def read_json(path: Path) -> dict:
-    """The object in a JSON file; stricter than Python: no NaN, no infinity, no key twice, 16 MB.  Raises InputError."""
+    """The object in a JSON file of at most 16 MB, without NaN, infinity or duplicate keys.  Raises InputError."""
     try:
         text = read_bytes(path, MAX_BYTES).decode("utf-8-sig")
         value = json.loads(text, parse_constant=_reject, object_pairs_hook=_unique)
@@ -62,7 +62,7 @@ def _unique(pairs: list) -> dict:
 
 
 def read_transforms(path: Path) -> tuple[list[Frame], list[str]]:
-    """All frames by ``view_index`` (missing: 0; else file order), and notes.
+    """All frames ordered by ``view_index`` (default 0), then file order, and notes.
 
     Raises InputError naming the frame and the field.
     """
