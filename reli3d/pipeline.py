@@ -279,17 +279,17 @@ class ReconstructOptions:
 
     texture_size: texels per side, 256 to 4096.  resolution: cubes per side of the FlexiCubes grid, 16 to 256; None: the
     preset's value.  normalization: how the object is placed in the network's cube.  ``hull``: the bounding box of the
-    visual hull is centered and its longest side scaled to 1.  ``none``: poses as stored.  ``auto``: as ``hull`` with
-    the box ``views.object_box`` if there is one; otherwise poses as stored if the visual hull lies in the cube, near
+    visual hull is centered and its longest side scaled to 1.  ``none``: poses as stored.  ``auto``: like ``hull``, with
+    ``views.object_box`` as the box, if it is set; otherwise poses as stored if the visual hull lies in the cube, near
     its center and not much smaller (:func:`~reli3d.views.normalize.normalize`); otherwise ``hull``.  A
-    :class:`~reli3d.views.similarity.Similarity`: the transform from the input to the model frame.  None (not the
-    string): ``auto`` for the bundled network, ``none`` for the published one.  up: axis of the cameras' world frame
-    that becomes +Y: ``x``, ``y`` or ``z``, optionally with a minus sign.  uv: unwrapping method, ``project`` or
-    ``xatlas``.  hero: index of the reference view.  background: image region that the lighting estimate reads,
-    ``masked`` (the object only), ``visible`` (the background too) or ``auto`` (``visible`` if all views have a
-    background and the weights were trained with it, else ``masked``).  symmetry: ``auto`` completes objects with a
-    detected mirror plane (bundled network only), or ``off``.  Raises InputError for an invalid value; ``hero`` is
-    checked when views are given.
+    :class:`~reli3d.views.similarity.Similarity`: the transform from the input to the model frame.  None, the default:
+    ``auto`` for the bundled network, ``none`` for the published network.  up: axis of the cameras' world frame that
+    becomes +Y: ``x``, ``y`` or ``z``, optionally with a minus sign.  uv: unwrapping method, ``project`` or ``xatlas``.
+    hero: index of the reference view.  background: image region that the lighting estimate reads, ``masked`` (the
+    object only), ``visible`` (the background too) or ``auto`` (``visible`` if all views have a background and the
+    weights were trained with it, else ``masked``).  symmetry: ``auto`` completes objects with a detected mirror plane
+    (bundled network only), or ``off``.  Raises InputError for an invalid value; ``hero`` is checked by
+    :func:`reconstruct`.
 
     >>> options = reli3d.ReconstructOptions(texture_size=512, symmetry="off")
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe"), options=options)
@@ -415,7 +415,7 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     surface, material (base color, roughness, metallic, shading normals) and lighting are each blended between their
     initial (weight 0) and fitted (weight 1) values, with weight 1, 1/2 or 0.  Weights are tried in a fixed order, from
     the complete fit to the fitted surface alone.  The result is the first blend whose mean PSNR over the fitted, the
-    held-out and all views is not lower than the initial PSNR, within a small tolerance; if there is none, it is
+    held-out and all views is not lower than the initial PSNR, within a small tolerance; if there is none, the result is
     ``asset``.
 
     views: any number, in the frame of ``asset``, which is the cameras' frame unless ``ReconstructOptions.up`` changed

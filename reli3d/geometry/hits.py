@@ -20,9 +20,8 @@ class Hits:
     """First hits of rays, from :meth:`reli3d.RayScene.intersect`.
 
     face: ``(...)`` int32, -1 for a miss.  t: ``(...)`` ray parameter: the hit is at ``origin + t * direction``; inf for
-    a miss.  bary: ``(..., 2)`` weights of the face's vertices 1 and 2; the weight of vertex 0 is ``1 - b1 - b2``; 0 for
-    a miss.  valid: ``face >= 0``.  Gradients of ``t`` and ``bary`` reach the rays, and the vertices passed to
-    ``intersect``.
+    a miss.  bary: ``(..., 2)`` weights of the face's vertices 1 and 2 (vertex 0: ``1 - b1 - b2``); 0 for a miss.
+    valid: ``face >= 0``.  Gradients of ``t`` and ``bary`` reach the rays, and the vertices passed to ``intersect``.
 
     >>> hits = reli3d.RayScene(mesh).intersect(origins, directions)
     >>> points = reli3d.surface_points(mesh, None, hits.face[hits.valid], hits.bary[hits.valid])

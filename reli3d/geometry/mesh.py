@@ -26,9 +26,9 @@ class Mesh:
 
     vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32, counter-clockwise seen from outside.  normals: ``(V, 3)``
     unit.  uv: ``(V, 2)``, u right, v down, as glTF.  tangents: ``(V, 4)`` unit, w = +-1, bitangent = w cross(normal,
-    tangent).  colors: ``(V, 3)`` linear factors of the base color.  Numpy arrays and other integer types are converted
-    if the conversion is exact.  Methods: ``.with_normals()``, ``.with_tangents()``.  Gradients pass through.
-    Raises TypeError for a wrong dtype, ValueError for a wrong shape or device, or a face index out of range.
+    tangent).  colors: ``(V, 3)`` linear factors of the base color.  NumPy arrays and other integer types are converted
+    if the conversion is exact.  Methods: ``.with_normals()``, ``.with_tangents()``.  Gradients pass through.  Raises
+    TypeError for a wrong dtype, ValueError for a wrong shape or device, or a face index out of range.
 
     >>> triangle = reli3d.Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
     >>> scene = reli3d.RayScene(triangle)

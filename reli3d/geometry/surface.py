@@ -100,10 +100,10 @@ def extract_surface(
     ``(K, 8)``, beta ``(K, 12)``, gamma ``(K,)``: positive weights for cube corners, cube edges and quad splitting;
     None: 1.  K is the number of all cubes, X * Y * Z, unless ``cubes`` is given.  cubes: ``(K,)`` int64 from
     :func:`~reli3d.geometry.surface.surface_cubes`; the weights then have rows for these cubes only.  closed: cap the
-    surface at the box.  center: split each quad into four triangles around an additional vertex, instead of into two.
+    surface at the box.  center: split each quad into four triangles around an additional vertex, not into two.
 
-    Faces are counter-clockwise seen from the positive side.  A field of one sign is valid: a positive one gives an
-    empty mesh, a negative one the box if ``closed``.  Gradients reach sdf, deformation, alpha, beta and, with
+    Faces are counter-clockwise seen from the positive side.  A field of one sign is valid: a positive field gives an
+    empty mesh, a negative field the box if ``closed``.  Gradients reach sdf, deformation, alpha, beta and, with
     ``center``, gamma.  Bitwise identical for any number of threads.
 
     Raises TypeError for a wrong dtype, and ValueError in these cases: a wrong shape; NaN or infinity in ``sdf``;

@@ -42,9 +42,9 @@ def eval_bsdf(
 
     wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha: ``(...)`` GGX width,
     ``roughness**2``.  metallic: ``(...)`` in [0, 1].  All are tensors; leading axes broadcast.  diffuse_model: Fresnel
-    factor of the diffuse term.  ``conserving``: the transmission in and out, (1 - F)(1 - F), with F evaluated at the
-    angles to the surface normal and reduced for rough surfaces; the albedo is at most 1.  ``published``: 1 - F at the
-    half vector, the formula of ReLi3D's shader and of glTF 2.0's appendix B.  Gradients reach all five tensors; the
+    factor of the diffuse term.  ``conserving``: the product of 1 - F for ``wo`` and for ``wi``, with F evaluated at
+    their angles to the surface normal and reduced for rough surfaces; the albedo is at most 1.  ``published``: 1 - F at
+    the half vector, the formula of ReLi3D's shader and of glTF 2.0's appendix B.  Gradients reach all five tensors; the
     gradient of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless float32, ValueError for a wrong
     shape or device, or an unknown model.  Source: glTF 2.0, appendix B; GGX of Walter et al. 2007 with Smith's
     height-correlated masking.
@@ -97,8 +97,8 @@ def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") ->
     wo, wi: ``(..., 3)`` unit, local frame.  alpha: tensor ``(...)``, GGX width.  Leading axes broadcast.  lobe: as in
     :func:`sample_bsdf`.  No gradient, so detach ``wi`` to differentiate an estimate; :func:`pdf_ggx_vndf` has
     gradients.  The density can be 0: clamp it before dividing.  For ``visible`` and ``cosine`` clamping adds no bias,
-    because the BSDF is 0 wherever the density is.  An estimate with ``mirrored`` alone is biased: combine it with
-    ``visible``.  Raises TypeError unless float32, ValueError for a wrong shape or device, or an unknown lobe.
+    because the BSDF is also 0 wherever the density is 0.  An estimate with ``mirrored`` alone is biased: combine it
+    with ``visible``.  Raises TypeError unless float32, ValueError for a wrong shape or device, or an unknown lobe.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u)
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi)

@@ -122,7 +122,7 @@ def shape_of(value: object) -> str:
 def file_within(root: Path, where: str, field: str, value: object) -> Path:
     """Path of the file that ``value`` names relative to ``root``.  Raises InputError if it leaves ``root``.
 
-    Errors are values that are not text, URLs, NUL, absolute paths, and files outside ``root`` (through ``..`` or a
+    Errors are non-text values, text with NUL, URLs, absolute paths, and files outside ``root`` (through ``..`` or a
     link).  The file need not exist.
     """
     if not isinstance(value, str) or not value.strip():
