@@ -357,7 +357,7 @@ def reconstruct(views: Views, *, weights: str | Network = "small", device: str =
     ``cpu`` or ``cuda``, ignored for a loaded network; the asset is on the network's device.  options: see
     :class:`ReconstructOptions`.  watch: receives the seconds of each stage.
 
-    The asset is in the frame of the cameras, in their units, with ``options.up`` as +Y.  Deterministic.  Runs under
+    The asset is in the cameras' world frame and units, with ``options.up`` made +Y.  Deterministic.  Runs under
     ``torch.no_grad``, so nothing has gradients; :func:`refine` optimizes the result.  Raises TypeError unless ``views``
     are Views; InputError if the masks' visual hull is empty, or for weights that cannot be read; NoSurface, an
     InputError, if the network predicts no surface.  Source: the ReLi3D paper, ICLR 2026.

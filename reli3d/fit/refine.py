@@ -99,10 +99,10 @@ def refine(
     views: images, masks and cameras in the frame of ``asset``.  seconds, steps: the budget, exactly one of the two;
     with ``steps`` the result is deterministic on one machine.  resolution: grid cells along the longest side, raised
     automatically for thin objects (:func:`~reli3d.fit.shape.start_grid`).  weights: of the loss terms.  cameras:
-    optimize the camera poses as well.  light: ``object``, lighting fixed to the object; ``camera``, lighting that moves
-    with the camera (a turntable or a flash); or a lighting name per view.  For the last two, the result's environment
-    is that of view 0.  seed: of all random numbers.  bar: show progress on stderr.  interrupt: called before every
-    step; once it returns True the fit ends with the best result so far.
+    optimize the camera poses as well.  light: ``object``, fixed to the object; ``camera``, moving with the camera (a
+    turntable or a flash); or a name per view, equal for equal lighting.  For the last two, the result's environment is
+    that of view 0.  seed: of all random numbers.  bar: show progress on stderr.  interrupt: called before every step;
+    once it returns True the fit ends with the best result so far.
 
     With three or more views some are held out (:func:`held_out`): their masks are used, their colors only to select
     which parts of the fit are kept (:func:`~reli3d.fit.choice.chosen`).  The inputs are detached: no gradient reaches

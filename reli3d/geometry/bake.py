@@ -207,8 +207,8 @@ def bake(
     returns ``{name: (N, C)}``, or one tensor, which is named "value".  Results are stored unchanged, in any range;
     :class:`~reli3d.render.asset.TextureSet` expects [0, 1].  texels: from
     :func:`~reli3d.geometry.bake.rasterize_texels`, for reuse.  tangents: also pass tangents ``(N, 4)`` as the third
-    argument.  values: vertex attributes ``(V, C)``, interpolated and passed as the last argument.  fill: fill all other
-    texels from the nearest valid texel; if False, they are 0.
+    argument.  values: vertex attributes ``(V, C)``, interpolated and passed as the last argument.  fill: fill uncovered
+    texels from the nearest covered one; if False, they are 0.
 
     No gradient.  Raises TypeError for a wrong type or dtype; ValueError without ``uv``, if the surface covers no texel,
     or if ``fn`` returns a wrong shape or a varying number of channels.
