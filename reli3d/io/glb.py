@@ -213,7 +213,7 @@ def write_glb(
 
     asset: its mesh needs normals, UV and tangents, as returned by :func:`reconstruct` and :func:`read_glb`; for other
     meshes, :func:`unwrap` adds UV and normals, and :meth:`Mesh.with_tangents` adds tangents.  extras: JSON values for
-    glTF's ``asset.extras``.  double_sided: if None, false for a watertight mesh, otherwise true.  translation: of the
+    glTF's ``asset.extras``.  double_sided: None: true unless the mesh is watertight.  translation: of the
     node, for objects so far from the origin that float32 vertices would lose precision.  textures: ``png``, or ``webp``
     (lossless, smaller, needs a viewer with ``EXT_texture_webp``).  Raises TypeError for a wrong type; ValueError for
     missing attributes, values that are non-finite or outside [0, 1], non-unit normals, or a file of 4 GiB or more;

@@ -144,9 +144,8 @@ class Environment:
     def cdf(self) -> EnvironmentCDF:
         """Importance-sampling CDF; the weight of a texel is the integral of the bilinear luminance over it.
 
-        This integral equals the luminance filtered by (1/8, 3/4, 1/8) along each axis, so the density is positive
-        wherever the lookup is.  A black map is sampled uniformly over the sphere.  Raises ValueError for a non-finite
-        texel.
+        This integral equals the luminance filtered by (1/8, 3/4, 1/8) along each axis, so the density is 0 only where
+        the lookup is 0.  A black map is sampled uniformly over the sphere.  Raises ValueError for a non-finite texel.
         """
         radiance = self.radiance.detach().double()
         if not bool(torch.isfinite(radiance).all()):

@@ -142,7 +142,7 @@ def render_lights(
     scene: RayScene | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> list[Render]:
-    """:func:`render_asset` under each of ``environments``, with bitwise identical results.
+    """:func:`render_asset` under each of ``environments``, bitwise equal to single calls.
 
     Primary hits and materials are evaluated once; all images share every field except ``radiance``.  The other
     arguments are those of :func:`render_asset`.

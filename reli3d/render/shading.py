@@ -144,7 +144,7 @@ def shade_lights(
     options: ShadeOptions = DEFAULT,
     pixels: Tensor | None = None,
 ) -> list[Tensor]:
-    """:func:`shade` under each of ``environments``, with bitwise identical results.
+    """:func:`shade` under each of ``environments``, bitwise equal to single calls.
 
     If no gradients are needed, shadow rays that do not depend on the environment are traced only once.
     """
@@ -257,7 +257,7 @@ def _inputs(tensors: Sequence[Tensor], job: _Job) -> list:
 
 
 def struct_of_points(values: Sequence[Tensor], pixels: Tensor) -> kernels.Points:
-    """Contiguous arrays in the order of :func:`shaded_arrays`, and the sample index of each point."""
+    """Contiguous arrays in the order of :func:`shaded_arrays`, and the seed index of each point."""
     names = ("position", "normal", "ng", "wo", "base_color", "alpha", "metallic")
     kinds = [wp.vec3] * 5 + [wp.float32] * 2
     return struct_of(kernels.Points, **dict(zip(names, zip(values, kinds), strict=True)), pixel=(pixels, wp.int32))
