@@ -1,8 +1,8 @@
-"""Relightable 3D assets from posed photographs, and the differentiable operations they are made of.
+"""Relightable 3D assets from posed photographs, and a library of differentiable operations for them.
 
-Public are the names of ``reli3d.__all__`` (``help(reli3d.shade)`` documents one), the packages ``geometry``,
-``render``, ``io`` and ``fit``, and the module ``errors``.  Each name of ``__all__`` is loaded from its module on first
-use: ``import reli3d`` alone loads neither torch nor Warp.
+The public API consists of the names in ``reli3d.__all__`` (documented by, for example, ``help(reli3d.shade)``), the
+packages ``geometry``, ``render``, ``io`` and ``fit``, and the module ``errors``.  Names in ``__all__`` are imported on
+first use: ``import reli3d`` alone loads neither torch nor Warp.
 """
 
 from importlib import import_module
