@@ -100,7 +100,7 @@ def refine(
     with ``steps`` the result is deterministic on one machine.  resolution: grid cells along the longest side, raised
     automatically for thin objects (:func:`~reli3d.fit.shape.start_grid`).  weights: of the loss terms.  cameras:
     optimize the camera poses as well.  light: ``object``, fixed to the object; ``camera``, moving with the camera (a
-    turntable or a flash); or a name per view, equal for equal lighting.  For the last two, the result's environment is
+    turntable or a flash); or names per view; equal ones share lighting.  For the last two, the result's environment is
     that of view 0.  seed: of all random numbers.  bar: show progress on stderr.  interrupt: called before every step;
     once it returns True the fit ends with the best result so far.
 

@@ -93,7 +93,7 @@ class RayScene:
     ) -> Hits:
         """First hit of every ray, differentiable in the rays and in ``vertices``.
 
-        origins, directions: ``(..., 3)`` float32, broadcast; ``directions`` may have any length, the unit of ``t``.
+        origins, directions: ``(..., 3)`` float32, broadcast; ``t`` is in units of the length of ``directions``.
         vertices: ``(V, 3)``, the tensor that receives gradients, equal to the vertices of the scene (call :meth:`refit`
         after a change); None: no vertex gradients, even if the mesh's vertices require them.  t_max: a number or
         ``(...)``, exclusive.  A miss has ``face = -1``, ``t = inf``, ``bary = 0`` and gradient 0.
