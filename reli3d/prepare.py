@@ -23,12 +23,12 @@ MAX_MIRRORED = 8  # views: the network reads 16 including mirror images
 
 @dataclass(frozen=True)
 class Prepared:
-    """Views in the model's frame: the network's input, and images of ``DETAIL`` pixels for lookup at points."""
+    """Views in the model frame: the network input, and images of ``DETAIL`` pixels for lookup at points."""
 
     batch: ViewBatch
     images: Tensor  # (V, D, D, 4) sRGB and signed silhouette distance
     camera: Camera  # of ``images``
-    mirrored: int = 0  # number of views at the end that are mirror images of the first ones, in order
+    mirrored: int = 0  # number of views at the end that are mirror images of the first views, in order
 
     def with_mirror(self, plane: MirrorPlane) -> Prepared:
         """The views, followed by their mirror images: flipped images with cameras mirrored at ``plane``."""

@@ -27,8 +27,8 @@ def gathered(mesh: Mesh, images: InputImages, *, seed: int) -> Tensor:
     all bounces, is the mean color of the images in which it is visible.  Points that no camera sees get the mean of the
     other points.  Faces emit on both sides.
 
-    mesh: with normals, in the fit's box [-1, 1]^3.  images: those whose colors may be used; exposures are taken as 1.
-    seed: of the ray directions.  No gradient.  Raises ValueError without normals.
+    mesh: with normals, in the fit's box [-1, 1]^3.  images: input images whose colors may be used; exposures are taken
+    as 1.  seed: random seed of the ray directions.  No gradient.  Raises ValueError without normals.
     """
     position, normal = mesh.vertices, present("mesh.normals", mesh.normals)
     scene = RayScene(position, mesh.faces)

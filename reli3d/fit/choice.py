@@ -172,8 +172,8 @@ def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> 
 
     A candidate is accepted if its mean PSNR is at most ``PSNR_TOLERANCE_DB`` below the start's on the ``used`` views,
     on the ``held`` views and on all views; the limits are ``SURFACE_TOLERANCES_DB`` if only the surface changes.  With
-    fewer than ``MIN_VIEWS_FULL_WEIGHT`` used views, the weight of the material is at most 1/2, as is that of the
-    lighting if a view is held out.  If no candidate is accepted, the start is returned.
+    fewer than ``MIN_VIEWS_FULL_WEIGHT`` used views, the material weight is at most 1/2, and so is the lighting weight
+    if a view is held out.  If no candidate is accepted, the start is returned.
 
     used, held: indices of views.  before: errors ``(V,)`` of the start.  Each candidate's light scale is fitted to the
     used views, because the fit underestimates the lighting: the loss uses the tangent of the display curve, which rises

@@ -17,7 +17,7 @@ VERTEX_ITERATIONS = 20  # that move the vertices towards their faces' planes
 def neighbor_faces(faces: Tensor) -> Tensor:
     """Face ``(F, 3)`` int64 across each edge ``(0, 1), (1, 2), (2, 0)`` of ``faces (F, 3)``.
 
-    The face itself where there is not exactly one face across the edge.
+    An edge without exactly one face across it gives the face itself.
     """
     across = torch.from_numpy(face_neighbors(faces.cpu().numpy())).to(faces.device).long()
     own = torch.arange(len(faces), device=faces.device, dtype=torch.int64)[:, None]

@@ -111,7 +111,7 @@ def near_start(grids: Sequence[Tensor]) -> Tensor:
 
 
 def near_base_color(change: Tensor, weights: Weights, views: int) -> Tensor:
-    """Robust prior that pulls the base color to the start, mean over points; change: ``(N, 3)``, of the logits.
+    """Robust prior that pulls the base color to the start, mean over points; change: ``(N, 3)`` in logits.
 
     Few views constrain normals and lighting poorly, and the residual shading would be baked into the base color as a
     small change at most points.  Correcting a wrong initial color needs a large change, so the gradient decreases above

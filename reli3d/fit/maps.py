@@ -75,7 +75,7 @@ class Pixels:
 def traced(data: FixedSurface, scene: RayScene, seed: int) -> Pixels:
     """The pixels of the used views that are at least one pixel inside the masks and whose rays hit the surface.
 
-    scene: rays against the surface.  seed: of the random order.
+    scene: rays against the surface.  seed: random seed of the order.
     """
     asset, images = data.asset, data.images
     inside, mesh, parts = images.inside(), asset.mesh, []
@@ -116,9 +116,8 @@ def traced(data: FixedSurface, scene: RayScene, seed: int) -> Pixels:
 class Estimate:
     """Parameters of the shading estimate in one step.
 
-    scene: occluders; None: no shadows.  samples: counts of light, BSDF and cosine samples.  seed: of the random
-    numbers.  independent: use two independent estimates, for an unbiased gradient; False: the gradient of the returned
-    loss.
+    scene: occluders; None: no shadows.  samples: counts of light, BSDF and cosine samples.  seed: random seed.
+    independent: use two independent estimates, for an unbiased gradient; False: the gradient of the returned loss.
     """
 
     scene: RayScene | None

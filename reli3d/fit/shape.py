@@ -194,8 +194,9 @@ def shape_loss(
 ) -> Tensor:
     """Loss of one step of the surface fit; gradients reach every part of ``unknowns`` except ``detail``.
 
-    progress: of the fit, in [0, 1].  seed: of the step's points, views and light samples.  independent: use two
-    independent shading estimates, for an unbiased gradient; False, for tests: the gradient of the returned loss.
+    progress: progress of the fit in [0, 1].  seed: random seed of the step's points, views and light samples.
+    independent: use two independent shading estimates, for an unbiased gradient; False, for tests: the gradient of the
+    returned loss.
     """
     rng = torch.Generator().manual_seed(seed)
     mesh = extracted(unknowns.sdf, data.bound, data.grid)

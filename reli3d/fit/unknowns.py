@@ -104,7 +104,7 @@ class Start:
 
 
 def material_logits(points: SurfacePoints) -> Tensor:
-    """``(N, 5)``: logits of linear base color, of roughness mapped from its range to [0, 1], and of metallic."""
+    """Logits ``(N, 5)`` of linear base color, roughness (mapped from its range to [0, 1]) and metallic."""
     rough = (points.roughness - MIN_ROUGHNESS) / (MAX_ROUGHNESS - MIN_ROUGHNESS)
     values = torch.cat([points.base_color, rough[:, None], points.metallic[:, None]], 1)
     return torch.logit(values.clamp(LOGIT_MARGIN, 1.0 - LOGIT_MARGIN))

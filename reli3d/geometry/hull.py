@@ -132,10 +132,10 @@ def mirror_residual(
 def hull_span(origins: Tensor, directions: Tensor, radius: float, distance: Tensor, camera: Camera) -> Tensor:
     """Ray parameters ``(N, 2)`` of the first entry into the visual hull and the last exit.
 
-    origins, directions: ``(N, 3)``, directions nonzero, of any length.  radius: of a sphere around the world origin
-    that clips the hull.  The other arguments are those of :func:`hull_distance`.  For a ray that misses the hull, both
-    are the parameter of the closest approach.  Parts thinner than 0.004 along the ray may be missed.  No gradient.
-    Source: sphere tracing of Hart 1996.
+    origins, directions: ``(N, 3)``, directions nonzero, of any length.  radius: radius of the sphere around the world
+    origin to which the hull is clipped.  The other arguments are those of :func:`hull_distance`.  For a ray that misses
+    the hull, both are the parameter of the closest approach.  Parts thinner than 0.004 along the ray may be missed.  No
+    gradient.  Source: sphere tracing of Hart 1996.
     """
     check("origins", origins, last=3)
     check("directions", directions, last=3, like=origins)

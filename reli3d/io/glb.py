@@ -1,6 +1,6 @@
 """Writes GLB files: one mesh, one metallic-roughness material, three PNG or WebP textures (glTF 2.0, Khronos).
 
-Axes and units are those of glTF (+Y up, right-handed), so nothing is rotated.  Base color is 8-bit sRGB; roughness and
+Axes and units are as in glTF (+Y up, right-handed), so nothing is rotated.  Base color is 8-bit sRGB; roughness and
 metallic are the green and blue channel of a linear texture.  All factors are 1.
 """
 
@@ -213,11 +213,11 @@ def write_glb(
 
     asset: its mesh needs normals, UV and tangents, as returned by :func:`reconstruct` and :func:`read_glb`; for other
     meshes, :func:`unwrap` adds UV and normals, and :meth:`Mesh.with_tangents` adds tangents.  extras: JSON values for
-    glTF's ``asset.extras``.  double_sided: None: true unless the mesh is watertight.  translation: of the
-    node, for objects so far from the origin that float32 vertices would lose precision.  textures: ``png``, or ``webp``
-    (lossless, smaller, needs a viewer with ``EXT_texture_webp``).  Raises TypeError for a wrong type; ValueError for
-    missing attributes, values that are non-finite or outside [0, 1], non-unit normals, or a file of 4 GiB or more;
-    OSError if writing fails.
+    glTF's ``asset.extras``.  double_sided: None: true unless the mesh is watertight.  translation: translation of the
+    glTF node, for objects so far from the origin that float32 vertices would lose precision.  textures: ``png``, or
+    ``webp`` (lossless, smaller, needs a viewer with ``EXT_texture_webp``).  Raises TypeError for a wrong type;
+    ValueError for missing attributes, values that are non-finite or outside [0, 1], non-unit normals, or a file of 4
+    GiB or more; OSError if writing fails.
 
     >>> reli3d.write_glb("object.glb", asset, extras={"license": "CC0-1.0"})
     >>> parts = reli3d.read_glb("object.glb")

@@ -1,9 +1,9 @@
 """Atomic replacement of a result folder: files are written to a sibling folder, which is exchanged with it.
 
-While ``NAME`` is made, its sibling ``.NAME.partial`` holds ``lock`` (held by the process at work), ``new`` (the
-files) and, during the exchange, ``old``.  A killed process leaves it behind; the next one that claims ``NAME``
-completes the exchange or removes the files.  Linux exchanges two folders in one step (renameat2 with RENAME_EXCHANGE).
-Elsewhere two renames are needed; between them ``NAME`` is missing and ``new`` is complete.
+While ``NAME`` is written, its sibling ``.NAME.partial`` contains ``lock`` (held by the writing process), ``new`` (the
+files) and, during the exchange, ``old``.  A killed process leaves this sibling behind; the next process that claims
+``NAME`` completes the exchange or removes the files.  Linux exchanges two folders in one step (renameat2 with
+RENAME_EXCHANGE).  Elsewhere two renames are needed; between them ``NAME`` is missing and ``new`` is complete.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)  # file systems that have
 
 
 def check_folder(folder: Path) -> Path:
-    """``folder``, there or not, with links resolved; nothing is written.  Raises InputError where it takes no file."""
+    """``folder``, existing or not, with links resolved; writes nothing.  Raises InputError if it cannot hold files."""
     folder = Path(os.path.realpath(folder))
     for part in folder.parts:
         if (size := len(os.fsencode(part))) > LONGEST:
@@ -63,9 +63,9 @@ def check_place(folder: Path) -> Path:
 def claimed(folder: Path, ours: Collection[str]) -> Iterator[Callable]:
     """Locks ``folder`` for this process; an interrupted exchange is completed first.
 
-    Yields ``replacing()``, a context manager of an empty folder that replaces ``folder`` on exit without an error.
-    ours: names of the files that belong to a result; others in ``folder`` are kept. Raises InputError for a place where
-    nothing can be written, OSError where another process holds it.
+    Yields ``replacing()``, a context manager for an empty folder that replaces ``folder`` on exit without an error.
+    ours: names of the files that belong to a result; other files in ``folder`` are kept.  Raises InputError if the
+    place is not writable, OSError if another process holds the lock.
     """
     folder = check_place(folder)
     made = [p for p in folder.parents if not p.exists()]
@@ -122,7 +122,7 @@ def _settle(work: Path, folder: Path, ours: Collection[str]) -> None:
 
 
 def exchanged(first: Path, second: Path) -> bool:
-    """Exchange the names of two files or folders in one step; False, and nothing done, where the system cannot."""
+    """Exchanges the names of two files or folders atomically; if the system cannot, returns False and does nothing."""
     try:
         rename = ctypes.CDLL(None, use_errno=True).renameat2  # of glibc 2.28 and musl on Linux
     except (AttributeError, OSError, TypeError):
@@ -137,7 +137,7 @@ def exchanged(first: Path, second: Path) -> bool:
 
 
 def sibling(path: Path, before: str, after: str) -> Path:
-    """``path`` with its name between ``before`` and ``after``, or in its place a hash where that would be too long."""
+    """``path`` with its name between ``before`` and ``after``; a name that would be too long is replaced by a hash."""
     name = f"{before}{path.name}{after}"
     if len(os.fsencode(name)) > LONGEST:
         name = f"{before}{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:32]}{after}"

@@ -41,14 +41,14 @@ AZIMUTHS = 24  # number of candidates
 
 
 def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callable[[], np.ndarray]:
-    """Starts rendering the contact sheet in the pool; calling the result returns it, ``(H, W, 3)`` uint8.
+    """Starts rendering the contact sheet in the pool; calling the result returns the sheet, ``(H, W, 3)`` uint8.
 
-    It shows up to four input views; four novel views under the estimated lighting, then under the
-    studio of :mod:`reli3d.render.lights`; the maps of the first of them; the environment, row 0 up, center +X as in its
-    files, scaled to the mean ``ENVIRONMENT_MEAN``.
+    The sheet shows up to four input views; four novel views under the estimated lighting, then under the studio of
+    :mod:`reli3d.render.lights`; the maps of the first novel view; and the environment, row 0 up, +X at the center as in
+    files, scaled to mean ``ENVIRONMENT_MEAN``.
 
-    views: in the frame of ``asset``.  scene: rays against its mesh, made here if None.  Errors are raised by the call,
-    or at once on CUDA and where the bridge is serial.
+    views: in the frame of ``asset``.  scene: rays against the asset's mesh; None: built here.  Errors are raised by the
+    call, or immediately on CUDA or if the bridge is serial.
     """
     mesh = asset.mesh
     rays = scene if scene is not None else RayScene(mesh.vertices, mesh.faces)
@@ -135,10 +135,10 @@ def _sheet(rows: list[tuple[str, list[Image.Image]]], columns: int, *, last: int
 
 
 def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
-    """Selects ``COLUMNS`` cameras of ``TILE_PIXELS`` pixels around ``mesh``, each farthest in direction from the
-    cameras ``c2w`` and the selected ones; ordered by azimuth.
+    """Selects ``COLUMNS`` cameras of ``TILE_PIXELS`` pixels around ``mesh``, ordered by azimuth.
 
-    Their elevations above the horizon are ``ELEVATIONS`` (+Y is up), and the whole mesh is in view.
+    Each is farthest in direction from the cameras ``c2w`` and those already selected.  Elevations above the horizon are
+    ``ELEVATIONS`` (+Y is up), and the whole mesh is in view.
     """
     low, high = mesh.vertices.aminmax(dim=0)
     center = (low + high) / 2

@@ -47,14 +47,15 @@ def claim(folder: Path) -> AbstractContextManager[Callable]:
 
 
 def measure(mesh: Mesh, scene: RayScene, views: Views) -> Callable[[], dict]:
-    """Starts the measurements of a result in the pool: ``mesh``, the report of the mesh welded across its UV seams,
-    and ``mask_iou``, see :func:`mask_iou`, as plain values.
+    """Starts the measurements of a result in the pool, as plain values.
+
+    ``mesh``: the report of the mesh welded across UV seams.  ``mask_iou``: see :func:`mask_iou`.
     """
     return submit(lambda: {"mesh": asdict(report(mesh)), "mask_iou": mask_iou(scene, views)}, mesh.vertices.device)
 
 
 def mask_iou(scene: RayScene, views: Views) -> float:
-    """Mean intersection over union of the silhouettes of a mesh and the masks of ``views``, in one frame, to 1e-4.
+    """Mean intersection over union of a mesh's silhouettes and the masks of ``views`` in the same frame, to 1e-4.
 
     scene: rays against the mesh.
     """
@@ -80,7 +81,7 @@ def peak_memory_mib() -> float | None:
 
 @dataclass(frozen=True)
 class Encoded:
-    """Contents of the files of a result without its preview.  Calls block until the content is ready.
+    """Contents of the files of a result, except the preview.  Calls block until the content is ready.
 
     placed: ``mesh.glb``.  page: ``viewer.html``, in the frame of the mesh.
     """
@@ -102,9 +103,9 @@ def encode(
 ) -> Encoded:
     """Starts encoding a result in the pool; the encoders release the interpreter lock.
 
-    views: the input views, in the frame of ``asset``.  record: of ``run_info.json``, whose frames and weights
-    ``mesh.glb`` names too.  name: title of the page.  before: the asset without its refinement, also on the page.
-    translation: of the mesh in ``mesh.glb``, see :func:`~reli3d.io.glb.write_glb`; the page shows the mesh without it.
+    views: the input views, in the frame of ``asset``.  record: content of ``run_info.json``; its frames and weights are
+    also stored in ``mesh.glb``.  name: title of the page.  before: the asset before refinement, also shown on the page.
+    translation: translation of the mesh in ``mesh.glb``, see :func:`~reli3d.io.glb.write_glb`; not applied on the page.
     scene: rays against the mesh of ``asset``.
     """
     device = asset.mesh.vertices.device
@@ -142,8 +143,9 @@ def write_results(
 ) -> None:
     """Writes :data:`FILES`; on an error the folder is unchanged.  Raises OSError, ValueError.
 
-    replacing: of :func:`claim`.  sheet: of the asset, from :func:`~reli3d.output.preview.preview`.  info: content of
-    ``run_info.json``, to which the convention of the environment is added. comparison: sheet of a refinement.
+    replacing: from :func:`claim`.  sheet: contact sheet of the asset, from :func:`~reli3d.output.preview.preview`.
+    info: content of ``run_info.json``, to which the environment convention is added.  comparison: contact sheet of a
+    refinement.
     """
     light = encoded.asset.light
     info = {**info, "environment_centre": "+X"}  # a key that other programs read
@@ -161,9 +163,9 @@ def write_results(
 def frame_record(
     model_from_views: Similarity, output_from_views: Similarity, origin: Sequence[float], up: str
 ) -> tuple[dict, list[float]]:
-    """The frames of the output, as matrices on column vectors, and the translation that its mesh needs.
+    """The frames of the output, as matrices on column vectors, and the translation of the output mesh.
 
-    origin: of the frame of the views, in that of the folder, which the matrices begin with.
+    origin: origin of the views' frame in the folder's frame; the matrices map from the folder's frame.
     """
     shift = torch.tensor(origin, dtype=torch.float64, device="cpu")
     read = Similarity(1.0, torch.eye(3, dtype=torch.float64, device="cpu"), -shift)

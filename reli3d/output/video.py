@@ -1,4 +1,4 @@
-"""Encodes MP4 video by PyAV (``av``), an optional dependency whose wheel has FFmpeg's libraries."""
+"""Encodes MP4 video with PyAV (``av``), an optional dependency whose wheel includes FFmpeg's libraries."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ QUALITY = "18"  # x264's constant rate factor: no difference is seen from the fr
 
 
 def library() -> ModuleType:
-    """PyAV.  Raises ImportError, with what to install, where it is missing."""
+    """PyAV.  Raises ImportError that names what to install if it is missing."""
     try:
         return importlib.import_module("av")
     except ModuleNotFoundError as error:
@@ -20,7 +20,7 @@ def library() -> ModuleType:
 
 
 def mp4_bytes(frames: list[Image.Image], rate: int) -> bytes:
-    """MP4 file, H.264 in 4:2:0, of ``frames`` of one even size, composited over white if they have alpha."""
+    """MP4 file, H.264 in 4:2:0, of ``frames`` of equal, even size, composited over white if they have alpha."""
     av = library()
     data = io.BytesIO()
     with av.open(data, "w", format="mp4") as file:

@@ -1,4 +1,4 @@
-"""A self-contained HTML page that shows a reconstruction in a browser, from a file and without a network."""
+"""A self-contained HTML page that shows a reconstruction in a browser, offline."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MIN_TRANSFER = 1e-20  # against division by zero if nothing is blocked
 
 @dataclass(frozen=True)
 class Shown:
-    """A GLB file, and the :func:`shadow` of the mesh in it."""
+    """A GLB file and the :func:`shadow` of its mesh."""
 
     glb: bytes
     shadow: Mapping[str, str | float]
@@ -44,9 +44,9 @@ class Shown:
 def viewer_page(
     name: str, meshes: Mapping[str, Shown], light: Tensor, middle: Tensor, radius: float, stops: Sequence[dict]
 ) -> str:
-    """HTML page of ``meshes``, by name, under ``light`` ``(H, 2H, 3)`` and two lights of the package.
+    """HTML page of ``meshes``, by name, under ``light (H, 2H, 3)`` and two built-in environments.
 
-    middle ``(3,)``, radius: of the object, for the camera.  stops: of :func:`photograph_stops`.
+    middle ``(3,)``, radius: center and radius of the object, for the camera.  stops: from :func:`photograph_stops`.
     """
     lights = {"estimated light": light, **{k: make().radiance for k, make in LIGHTS.items()}}
     data = {
@@ -69,8 +69,9 @@ def viewer_page(
 
 
 def photograph_stops(views: Views) -> list[dict]:
-    """Camera stops of the page at the input views, in the frame of its meshes, with images scaled down to
-    ``MAX_IMAGE_PIXELS`` and with the masks as alpha.
+    """Camera stops at the input views, in the frame of the meshes.
+
+    Images are downsampled to ``MAX_IMAGE_PIXELS``, with the masks as alpha.
     """
     return [_stop(views, i) for i in range(len(views))]
 
@@ -80,10 +81,9 @@ def _base64(data: bytes) -> str:
 
 
 def shadow(mesh: Mesh, scene: RayScene | None = None) -> dict[str, str | float]:
-    """Self-shadowing of every vertex of ``mesh`` as spherical harmonics, 16 bytes each, deflated, in steps of
-    ``largest`` / 127.
+    """Self-shadowing of every vertex of ``mesh`` as spherical harmonics.
 
-    scene: rays against the mesh, made here if None.
+    Deflated, 16 bytes per vertex, in steps of ``largest`` / 127.  scene: rays against the mesh; None: built here.
     """
     blocked = blocked_transfer(mesh, scene=scene).cpu()
     largest = float(blocked.abs().amax()) if blocked.numel() else 0.0

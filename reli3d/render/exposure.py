@@ -1,8 +1,8 @@
-"""Scale of an asset's base color and lighting, whose product alone the images determine.
+"""Scale of an asset's base color and lighting; images determine only the product of both.
 
 The log brightness of the base color is the precision-weighted mean of three normal distributions: an albedo prior, the
-observed colors under a lighting prior, and the network's prediction.  The lighting is then scaled to match the mean
-color of the rendering to that of the images.
+observed colors under a lighting prior, and the network's prediction.  The lighting is then scaled so that rendering and
+images have the same mean color.
 """
 
 from __future__ import annotations

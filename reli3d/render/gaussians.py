@@ -66,7 +66,7 @@ def shade_gaussians(points: SurfacePoints, wo: Tensor, light: SphericalGaussians
     """Reflected radiance ``(N, 3)`` of ``points`` towards ``wo`` under ``light``, without shadows; linear Rec. 709.
 
     wo: ``(N, 3)`` unit, or one row for all points.  A point with non-finite inputs gives NaN.  Position and geometric
-    normal are not used.  The material is that of ``reli3d.kernels.bsdf``.  Diffuse term: closed-form cosine integral.
+    normal are not used.  The material model is in ``reli3d.kernels.bsdf``.  Diffuse term: closed-form cosine integral.
     Specular term: Wang et al. 2009, with GGX approximated by four Gaussians.
 
     Error against quadrature, for lighting around the mirror direction and viewing angles up to 45 degrees: 6 % at

@@ -78,7 +78,7 @@ def tangent_normals(mesh: Mesh, face: Tensor, bary: Tensor, normal: Tensor, mapp
 def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: Tensor) -> SurfacePoints:
     """Geometry and material at hits of a mesh, the input of :func:`reli3d.shade`.
 
-    mesh: with ``uv`` if textured.  textures: None gives a gray dielectric of base color 0.5, roughness 0.5, metallic 0.
+    mesh: with ``uv`` if textured.  textures: None: a gray dielectric with base color 0.5, roughness 0.5, metallic 0.
     face: ``(N,)`` int32, without misses.  bary: ``(N, 2)`` weights of vertices 1 and 2.  The shading normal is the
     interpolated vertex normal (the geometric normal if ``mesh.normals`` is None), perturbed by the normal map in the
     frame of ``mesh.tangents`` (of the UV gradients if ``mesh.tangents`` is None).

@@ -62,18 +62,18 @@ class Samples(NamedTuple):
 class ShadeOptions:
     """Options of :func:`shade`: sampling and material model.
 
-    samples: :class:`Samples`, or three counts in the same order, each at least 0.  seed: of the random numbers;
-    different seeds give independent noise.  In optimization, change the seed every step.  The gradient of one
-    rendering's squared residual is biased, because value and derivative share the same noise; for an unbiased gradient,
-    multiply the residuals of two renderings with different seeds.  antithetic: pairing of visible-normal samples:
-    ``opposite`` (opposite side of the lobe, see :func:`reli3d.antithetic`), ``mirrored`` (about the surface normal, as
-    in ReLi3D) or ``none``.  heuristic: MIS weights, ``balance`` or ``power``.  sequence: ``halton``, with a
-    Cranley-Patterson rotation per point and strategy, or ``random``.  alpha: GGX width of roughness r: ``squared``
-    (r^2) or, as in ReLi3D, ``linear`` (r).  diffuse_model: ``conserving`` or ``published``, see
-    :func:`reli3d.eval_bsdf`.  clamp: upper limit, per channel, of a sample's contribution ``w * f * L * cos(theta) /
-    p`` before division by its strategy's sample count (w: MIS weight, f: BSDF, L: radiance, theta: angle between the
-    direction and the shading normal, p: density); None: no limit.  check_inputs: raise ValueError for unnormalized
-    directions, materials outside [0, 1] or non-finite values.  Raises ValueError for an invalid count or choice.
+    samples: :class:`Samples`, or three counts in the same order, each at least 0.  seed: random seed; different seeds
+    give independent noise.  In optimization, change the seed every step.  The gradient of one rendering's squared
+    residual is biased, because value and derivative share the same noise; for an unbiased gradient, multiply the
+    residuals of two renderings with different seeds.  antithetic: pairing of visible-normal samples: ``opposite``
+    (opposite side of the lobe, see :func:`reli3d.antithetic`), ``mirrored`` (about the surface normal, as in ReLi3D) or
+    ``none``.  heuristic: MIS weights, ``balance`` or ``power``.  sequence: ``halton``, with a Cranley-Patterson
+    rotation per point and strategy, or ``random``.  alpha: GGX width of roughness r: ``squared`` (r^2) or, as in
+    ReLi3D, ``linear`` (r).  diffuse_model: ``conserving`` or ``published``, see :func:`reli3d.eval_bsdf`.  clamp: upper
+    limit, per channel, of a sample's contribution ``w * f * L * cos(theta) / p`` before division by its strategy's
+    sample count (w: MIS weight, f: BSDF, L: radiance, theta: angle between the direction and the shading normal, p:
+    density); None: no limit.  check_inputs: raise ValueError for unnormalized directions, materials outside [0, 1] or
+    non-finite values.  Raises ValueError for an invalid count or choice.
 
     >>> fast = reli3d.ShadeOptions(samples=reli3d.Samples(light=4, bsdf=4, cosine=2), seed=1)
     >>> image = reli3d.render_asset(asset, camera, light, options=fast)

@@ -114,9 +114,9 @@ def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: Ra
 def blend_outlines(image: Tensor, crossings: Crossings) -> Tensor:
     """``image (H, W, C)`` with the pixels of each crossing blended according to the position of the silhouette.
 
-    The pixel that the silhouette crosses is the one that changes.  The blends of several pairs add up; weights are
-    scaled down where their sum exceeds 1, so values stay between those of the neighbors.  Gradients reach the image and
-    the crossings.
+    Of each pair, the pixel that the silhouette crosses changes.  The blends of several pairs add up; weights are scaled
+    down where their sum exceeds 1, so values stay between those of the neighbors.  Gradients reach the image and the
+    crossings.
     """
     check("image", image, shape=("H", "W", "C"), like=crossings.place)
     flat = image.reshape(-1, image.shape[2])
