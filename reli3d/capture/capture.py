@@ -14,10 +14,12 @@ import numpy as np
 import torch
 from PIL import Image
 
+from reli3d.capture.fusion import fused_masks
 from reli3d.capture.mapping import Map, View, map_photos
 from reli3d.capture.masks import grabcut_mask, key_mask, moving_region, touches_border
 from reli3d.capture.photos import FEWEST, PHOTO_SUFFIXES, Photo, Progress, read_photos
-from reli3d.capture.scene import Plane, Scene, find_scene
+from reli3d.capture.rigidity import epipolar_fit, rigid_groups
+from reli3d.capture.scene import Scene, find_scene
 from reli3d.capture.sheet import contact_sheet
 from reli3d.errors import InputError, printable
 from reli3d.io.images import read_image
@@ -31,10 +33,10 @@ RESULT_FILES = ("images", "masks", "transforms.json", "capture.json", "capture.p
 MASK_METHODS = ("grabcut", "key", "rembg")
 MOST_VIEWS = 60  # of the object folder; more are thinned by the distance between their cameras
 MASK_SIDE = 512  # pixels of masks by which the visual hull is judged
-SURE_AGREEMENT = 0.99  # mean fraction of the masks that the hull fills, above which the first map is right
+SURE_AGREEMENT = 0.99  # mean fraction of the masks that the hull fills, above which they lack nothing
+RIGID_FIT = 0.95  # of the matches that fit pairs of views: cameras that fit more are right
 KEPT_FRACTION = 0.9  # of the first map's images that the second must register
 SAME_UP = math.cos(math.radians(15.0))  # between the upward directions of views that saw the object in one pose
-SAME_RIG = 0.02  # of the distance: residual of camera positions up to which two maps are the same but for a similarity
 OUTLIER_AGREEMENT = 0.8  # of the median: a view whose mask the hull fills less is left out
 SIDE_ELEVATION = 45.0  # degrees up to which a direction looks at a side of the object
 LEAST_REGISTERED, MOST_ERROR, WIDEST_GAP = 0.8, 1.0, 60.0
@@ -233,31 +235,44 @@ def _masks(
     return masks
 
 
-def _refined(segmented: _Segmented, scene: Scene, known, report: CaptureReport, progress: Progress):
-    """The map of the features inside the masks, if it is the better one, with its masks; the upward direction ``(3,)``
-    and the ground's height along it (None: unknown) in the frame of the map that is kept.
+def _refined(
+    segmented: _Segmented, scene: Scene, known: dict | None, report: CaptureReport, progress: Progress
+) -> tuple[_Segmented, np.ndarray, float | None]:
+    """The map in whose frame the object does not move, with its masks; the upward direction ``(3,)`` and the ground's
+    height along it (None: unknown) in that frame.
 
-    Features of the background agree among themselves even where the object was moved: only the object's own count.
+    Where matches inside the masks do not fit the map's cameras, the object was moved relative to its surroundings, and
+    the features inside the masks are mapped alone.  Matches outside, if they fit, know the lenses better, and the
+    cameras of each group of views between which the object stayed in its place.
     """
     first = segmented.found
     up = scene.plane.normal if scene.plane else _mean_up(first)
     ground = -scene.plane.offset if scene.plane else None
+    before = epipolar_fit(first, segmented.masks)
+    if before >= RIGID_FIT:
+        if known is None and scene.plane and _agreement(segmented.views, segmented.masks) < SURE_AGREEMENT:
+            segmented = _Segmented(first, fused_masks(first, scene, segmented.masks))
+        return segmented, up, ground
+    lenses = first if epipolar_fit(first, segmented.masks, inside=False) >= RIGID_FIT else None
     views = segmented.views
-    before = _agreement(views, segmented.masks)
-    if before > SURE_AGREEMENT:
-        return segmented, up, ground
     try:
-        second = map_photos([v.photo for v in views], progress, [segmented.masks[v.photo.name] for v in views])
+        second = map_photos([v.photo for v in views], progress, [segmented.masks[v.photo.name] for v in views], lenses)
     except InputError:
+        second = None
+    if (
+        second is None
+        or len(second.views) < KEPT_FRACTION * len(first.views)
+        or epipolar_fit(second, segmented.masks) <= before
+    ):
+        report.notes.append("the object was moved relative to its surroundings: its cameras are not accurate")
         return segmented, up, ground
-    again = [v for v in second.views if v.photo.name in segmented.masks]
-    if len(second.views) < KEPT_FRACTION * len(first.views) or _agreement(again, segmented.masks) <= before:
-        return segmented, up, ground
+    groups = rigid_groups(first, second) if lenses else []
     by_name = {v.photo.name: v for v in first.views}
-    pairs = [(by_name[v.photo.name], v) for v in second.views]
-    directions = np.stack([b.rotation.T @ a.rotation @ up for a, b in pairs])
-    alike = directions @ directions.T > SAME_UP  # an object that was turned over has two: that of most views is up
-    upward = directions[alike[alike.sum(1).argmax()]].mean(0)
+    if groups:
+        moved = {name: group.moved(by_name[name]) for group in groups for name in group.names}
+        second = replace(second, views=tuple(_posed(v, moved.get(v.photo.name)) for v in second.views))
+    report.notes.append("the object was moved relative to its surroundings: its own features decide on the cameras")
+    again = [v for v in second.views if v.photo.name in segmented.masks]
     support = None
     if known is None:
         support = {v.photo.name: v.pixels[scene.support[v.points]] for v in first.views}
@@ -267,24 +282,18 @@ def _refined(segmented: _Segmented, scene: Scene, known, report: CaptureReport, 
         known is None and _agreement(refined.views, masks) < _agreement(again, segmented.masks)
     ):
         refined = _Segmented(second, {v.photo.name: segmented.masks[v.photo.name] for v in again})
-    return refined, upward / np.linalg.norm(upward), _ground(pairs, scene.plane)
+    if groups and scene.plane:
+        up = groups[0].turn @ up
+        return refined, up, float(groups[0].apply(scene.plane.foot(scene.center)) @ up)
+    pairs = [(by_name[v.photo.name], v) for v in second.views]
+    directions = np.stack([b.rotation.T @ a.rotation @ up for a, b in pairs])
+    alike = directions @ directions.T > SAME_UP  # an object that was turned over has two: that of most views is up
+    upward = directions[alike[alike.sum(1).argmax()]].mean(0)
+    return refined, upward / np.linalg.norm(upward), None
 
 
-def _ground(pairs: list[tuple[View, View]], plane: Plane | None) -> float | None:
-    """Height of the plane of the first map of ``pairs`` in the second, where the two rigs are similar."""
-    if plane is None or len(pairs) < 3:
-        return None
-    a, b = (np.stack([pair[k].eye for pair in pairs]) for k in (0, 1))
-    a0, b0 = a.mean(0), b.mean(0)
-    u, s, vt = np.linalg.svd((b - b0).T @ (a - a0))
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    turn = u @ sign @ vt
-    scale = float((s * np.diag(sign)).sum() / ((a - a0) ** 2).sum())
-    residual = np.linalg.norm(scale * (a - a0) @ turn.T - (b - b0), axis=1)
-    if float(np.median(residual)) > SAME_RIG * float(np.median(np.linalg.norm(b - b0, axis=1))):
-        return None
-    on_plane = a0 - plane.height(a0[None])[0] * plane.normal
-    return float((b0 + scale * turn @ (on_plane - a0)) @ (turn @ plane.normal))
+def _posed(view: View, pose: View | None) -> View:
+    return replace(view, rotation=pose.rotation, translation=pose.translation) if pose else view
 
 
 def _mean_up(found: Map) -> np.ndarray:

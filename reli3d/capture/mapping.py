@@ -27,6 +27,7 @@ ENOUGH = 0.8  # fraction of the images whose registration needs no retry
 EXHAUSTIVE = 100  # images up to which each is matched with each
 SEED = 0
 DEFAULT_FOCAL = 1.2  # of the longer side, where EXIF has none: a phone's main camera, and COLMAP's own default
+LENS_STEPS = 8  # fixed-point iterations that undo the distortion of a lens
 MASK_MARGIN = 0.01  # of the longer side, by which masks are grown before features are limited to them
 
 
@@ -56,6 +57,19 @@ class View:
         bent = flat * (1.0 + self.radial * (flat**2).sum(-1, keepdims=True))
         return bent * self.focal + self.principal, local[:, 2]
 
+    def normalized(self, pixels: np.ndarray) -> np.ndarray:
+        """``x / z`` and ``y / z`` ``(N, 2)`` in the camera's axes of ``pixels (N, 2)``: the inverse of ``project``."""
+        bent = (pixels - self.principal) / self.focal
+        flat = bent
+        for _ in range(LENS_STEPS):
+            flat = bent / (1.0 + self.radial * (flat**2).sum(-1, keepdims=True))
+        return flat
+
+    def rays(self, pixels: np.ndarray) -> np.ndarray:
+        """World directions ``(N, 3)``, of depth 1, of ``pixels (N, 2)``."""
+        flat = self.normalized(pixels)
+        return np.concatenate([flat, np.ones((len(flat), 1))], 1) @ self.rotation
+
     def undistorted(self, image: np.ndarray, *, nearest: bool = False) -> np.ndarray:
         """``image`` as a pinhole of the same focal length and principal point shows it; black beyond its border."""
         h, w = self.photo.pixels.shape[:2]
@@ -70,12 +84,16 @@ class View:
 
 @dataclass(frozen=True)
 class Map:
-    """Registered views, and points with their mean reprojection errors."""
+    """Registered views, points with their mean reprojection errors, and matched features of pairs of views.
+
+    matches: indices of two views and the pixels ``(M, 2)`` in each, as the descriptors match them: no geometry is used.
+    """
 
     views: tuple[View, ...]
     points: np.ndarray  # (P, 3)
     error: np.ndarray  # (P,) pixels
     tracks: np.ndarray  # (P,) number of views that observe the point
+    matches: tuple[tuple[int, int, np.ndarray, np.ndarray], ...] = ()
 
     @property
     def mean_error(self) -> float:
@@ -83,13 +101,18 @@ class Map:
         return float(np.average(self.error, weights=self.tracks)) if len(self.error) else math.inf
 
 
-def map_photos(photos: Sequence[Photo], progress: Progress, masks: Sequence[np.ndarray] | None = None) -> Map:
+def map_photos(
+    photos: Sequence[Photo],
+    progress: Progress,
+    masks: Sequence[np.ndarray] | None = None,
+    lenses: Map | None = None,
+) -> Map:
     """The largest map of ``photos``.
 
     masks: ``(H, W)`` of each photo, nonzero where features are looked for.  Where less than ENOUGH of the photos are
     registered it is tried again with a lower contrast threshold and a relaxed first pair, then with larger images; the
     map of most images is kept.  With masks, which leave few features, the threshold is low at once.  The seed is
-    fixed.  Raises InputError where no two images can be matched.
+    fixed.  lenses: a map whose lenses are kept.  Raises InputError where no two images can be matched.
     """
     best: Map | None = None
     attempts = [(MAP_SIDES[0], False), (MAP_SIDES[0], True), (MAP_SIDES[1], True)]
@@ -99,7 +122,7 @@ def map_photos(photos: Sequence[Photo], progress: Progress, masks: Sequence[np.n
         del attempts[-1]
     for side, relaxed in attempts:
         with tempfile.TemporaryDirectory(prefix="reli3d-map-") as folder:
-            found = _mapped(photos, masks, Path(folder), side, relaxed, progress)
+            found = _mapped(photos, masks, lenses, Path(folder), side, relaxed, progress)
         if found and (best is None or len(found.views) > len(best.views)):
             best = found
         if best and len(best.views) >= ENOUGH * len(photos):
@@ -122,7 +145,7 @@ def _pycolmap() -> ModuleType:
     return module
 
 
-def _mapped(photos, masks, work: Path, side: int, relaxed: bool, progress: Progress) -> Map | None:
+def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bool, progress: Progress) -> Map | None:
     pycolmap = _pycolmap()
     pycolmap.set_random_seed(SEED)
     lenses = sorted({p.lens for p in photos}, key=str)
@@ -145,7 +168,12 @@ def _mapped(photos, masks, work: Path, side: int, relaxed: bool, progress: Progr
         reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL", default_focal_length_factor=DEFAULT_FOCAL)
         if masks is not None:
             reader.mask_path = str(work / "masks")
-        if photo.focal:
+        view = next((v for v in known.views if v.photo.lens == photo.lens), None) if known else None
+        if view:
+            scale = scales[names[0]]
+            values = view.focal * scale, *(view.principal * scale), view.radial
+            reader.camera_params = ",".join(str(float(x)) for x in values)
+        elif photo.focal:
             width, height = (round(s * scales[names[0]]) for s in photo.size)
             reader.camera_params = f"{photo.focal * scales[names[0]]},{width / 2},{height / 2},0"
         # Numbers the images in order: the extraction would number them in the order in which its threads finish.
@@ -165,6 +193,9 @@ def _mapped(photos, masks, work: Path, side: int, relaxed: bool, progress: Progr
         pairing.overlap, pairing.quadratic_overlap = 15, True  # offsets of 1 to 15, 16, 32, ...: these close loops
         pycolmap.match_sequential(database, pairing_options=pairing, verification_options=verification)
     options = pycolmap.IncrementalPipelineOptions(min_model_size=3, random_seed=SEED, extract_colors=False)
+    if known:
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     if relaxed:
         options.mapper.init_min_num_inliers = 50
         options.mapper.init_min_tri_angle = 8.0
@@ -181,7 +212,8 @@ def _mapped(photos, masks, work: Path, side: int, relaxed: bool, progress: Progr
     if not models:
         return None
     largest = max(models.values(), key=lambda m: m.num_reg_images())
-    return _read_model(largest, by_path, scales)
+    with pycolmap.Database.open(database) as data:
+        return _read_model(largest, data, by_path, scales)
 
 
 def _write(path: Path, pixels: np.ndarray, scale: float) -> None:
@@ -200,7 +232,7 @@ def _grown(mask: np.ndarray) -> np.ndarray:
     return cv2.dilate((mask > 0).astype(np.uint8) * 255, np.ones((size, size), np.uint8))
 
 
-def _read_model(model, by_path: dict[str, Photo], scales: dict[str, float]) -> Map:
+def _read_model(model, database, by_path: dict[str, Photo], scales: dict[str, float]) -> Map:
     index = {identifier: k for k, identifier in enumerate(model.points3D)}
     points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3)
     error = np.array([p.error for p in model.points3D.values()])
@@ -226,4 +258,18 @@ def _read_model(model, by_path: dict[str, Photo], scales: dict[str, float]) -> M
         )
     order = {id(photo): k for k, photo in enumerate(by_path.values())}
     views.sort(key=lambda v: order[id(v.photo)])
-    return Map(tuple(views), points, error, tracks)
+    return Map(tuple(views), points, error, tracks, _matches(views, database, by_path, scales))
+
+
+def _matches(views: list[View], database, by_path: dict[str, Photo], scales: dict[str, float]) -> tuple:
+    path_of = {id(photo): path for path, photo in by_path.items()}
+    paths = [path_of[id(v.photo)] for v in views]
+    numbers = [database.read_image_with_name(path).image_id for path in paths]
+    pixels = [database.read_keypoints(n)[:, :2] / scales[path] for n, path in zip(numbers, paths, strict=True)]
+    found = []
+    for b in range(len(views)):
+        for a in range(b):
+            pairs = database.read_matches(numbers[a], numbers[b]).astype(np.int64)
+            if len(pairs) > 0:
+                found.append((a, b, pixels[a][pairs[:, 0]], pixels[b][pairs[:, 1]]))
+    return tuple(found)

@@ -53,14 +53,14 @@ def grabcut_mask(view: View, found: Map, scene: Scene, support: np.ndarray | Non
             break
     else:  # it leaks into the background without end
         mask = found_masks[0]
-    return _full_size(_refined(view.photo.pixels, mask), view.photo.pixels.shape)
+    return full_size(refined(view.photo.pixels, mask), view.photo.pixels.shape)
 
 
 def _coarse_mask(
     pixels: np.ndarray, outline: np.ndarray, growth: float, seeds: np.ndarray, ground: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The mask at COARSE_SIDE, and its outer limit: the convex ``outline (K, 2)`` grown by ``growth``."""
-    image, scale = _reduced(pixels, COARSE_SIDE)
+    image, scale = reduced(pixels, COARSE_SIDE)
     limit = np.zeros(image.shape[:2], np.uint8)
     middle = outline.mean(0)
     grown = (middle + (outline - middle) * (1 + growth)) * scale
@@ -71,25 +71,25 @@ def _coarse_mask(
     for points, label in ((ground, cv2.GC_BGD), (seeds, cv2.GC_FGD)):
         for at in np.rint(points * scale).astype(int):
             cv2.circle(labels, at.tolist(), radius, label, -1)
-    return cleaned(_grabcut(image, labels, limit), seeds * scale), limit
+    return cleaned(grabcut(image, labels, limit), seeds * scale), limit
 
 
-def _refined(pixels: np.ndarray, coarse: np.ndarray) -> np.ndarray:
+def refined(pixels: np.ndarray, coarse: np.ndarray) -> np.ndarray:
     """``coarse`` at SIDE: segmented anew within BAND of its outline (Lombaert and others 2005, banded graph cuts)."""
-    image, scale = _reduced(pixels, SIDE)
+    image, scale = reduced(pixels, SIDE)
     if image.shape[:2] == coarse.shape:
         return coarse
-    mask = ((_full_size(coarse, image.shape) > 127) * 255).astype(np.uint8)
+    mask = ((full_size(coarse, image.shape) > 127) * 255).astype(np.uint8)
     size = 2 * round(BAND * max(mask.shape)) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     labels = np.where(mask > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[cv2.erode(mask, kernel, borderValue=255) > 0] = cv2.GC_FGD
     around = cv2.dilate(mask, kernel)
     labels[around == 0] = cv2.GC_BGD
-    return cleaned(_grabcut(image, labels, around), None)
+    return cleaned(grabcut(image, labels, around), None)
 
 
-def _grabcut(image: np.ndarray, labels: np.ndarray, limit: np.ndarray) -> np.ndarray:
+def grabcut(image: np.ndarray, labels: np.ndarray, limit: np.ndarray) -> np.ndarray:
     """The mask ``(H, W)`` of OpenCV's ``labels``, with the background's colors from a margin around ``limit``."""
     ys, xs = limit.nonzero()
     if len(ys) == 0:
@@ -115,7 +115,7 @@ def _reached(limit: np.ndarray, mask: np.ndarray) -> float:
 
 def key_mask(pixels: np.ndarray) -> np.ndarray | None:
     """Mask of the pixels that differ from the color of the image's border; None unless the border has one color."""
-    image, _ = _reduced(pixels, SIDE)
+    image, _ = reduced(pixels, SIDE)
     lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(np.float32)
     border = np.concatenate([lab[0], lab[-1], lab[:, 0], lab[:, -1]])
     middle = np.median(border, 0)
@@ -123,7 +123,7 @@ def key_mask(pixels: np.ndarray) -> np.ndarray | None:
     mask = ((np.abs(lab - middle) / spread).max(-1) > KEY_SIGMAS).astype(np.uint8) * 255
     mask = cleaned(cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), None)
     inside = float((mask > 0).mean())
-    return _full_size(mask, pixels.shape) if 0.002 < inside < 0.8 else None
+    return full_size(mask, pixels.shape) if 0.002 < inside < 0.8 else None
 
 
 def cleaned(mask: np.ndarray, seeds: np.ndarray | None) -> np.ndarray:
@@ -180,7 +180,7 @@ def touches_border(mask: np.ndarray) -> bool:
     return int(edge.sum()) > 0.004 * max(mask.shape)
 
 
-def _reduced(pixels: np.ndarray, side: int) -> tuple[np.ndarray, float]:
+def reduced(pixels: np.ndarray, side: int) -> tuple[np.ndarray, float]:
     scale = min(1.0, side / max(pixels.shape[:2]))
     if scale == 1.0:
         return pixels, 1.0
@@ -188,7 +188,7 @@ def _reduced(pixels: np.ndarray, side: int) -> tuple[np.ndarray, float]:
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), scale
 
 
-def _full_size(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def full_size(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if mask.shape == shape[:2]:
         return mask
     return cv2.resize(mask, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)

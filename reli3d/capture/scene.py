@@ -38,6 +38,10 @@ class Plane:
         """Signed distance ``(N,)`` of ``points (N, 3)``, positive above."""
         return points @ self.normal + self.offset
 
+    def foot(self, point: np.ndarray) -> np.ndarray:
+        """The point of the plane nearest to ``point (3,)``."""
+        return point - (point @ self.normal + self.offset) * self.normal
+
 
 @dataclass(frozen=True)
 class Scene:

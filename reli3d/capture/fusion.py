@@ -1,0 +1,281 @@
+"""Masks from all views together: what the support plane looks like, and the object's colors, fused in a volume.
+
+Where the colors of object and background are alike, one image does not show the outline.  Other views do: from above
+the object is in front of the plane, whose texture the views know from where it is not covered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from scipy import ndimage
+
+from reli3d.capture.mapping import Map, View
+from reli3d.capture.masks import COARSE_SIDE, full_size, grabcut, reduced, refined
+from reli3d.capture.scene import Plane, Scene
+
+TEXEL = 1.5  # pixels at COARSE_SIDE, at the cameras' median distance
+TEXTURE_VIEWS = 16  # views, spread evenly, relative to whose median the gains of all are
+TEXTURE_REACH = 0.9  # of the cameras' median distance: half the side of the textured square
+FEWEST_SAMPLES = 4  # views that show a texel
+COVER_MARGIN = 0.01  # of the longer side: around the object its outline is uncertain, and texels are not taken
+LEAST_SPREAD, MOST_SPREAD = 3.0, 25.0  # of 255: standard deviation of a texel over the views, and where it is unknown
+DARKEST = 8.0  # of 255: darker texels are counted as this bright in gains
+UNLIKE_PLANE = 3.0  # spreads from which a pixel does not show the plane
+NEAR_AND_AROUND = 9, 161  # pixels: sides of the squares by which the mask is grown; colors between are the background's
+FEWEST_PIXELS = 100  # from which a median or a mixture is taken
+SHADOWS = 0.05  # fraction of the plane's pixels that do not look like its texture
+COMPONENTS, COLOR_NOISE, COLOR_SAMPLES = 5, 2.0, 3000  # of a mixture of Gaussians; of 255; pixels
+LOWEST_DENSITY = -23.0  # logarithm of a density of colors, per 1 / 255^3
+PLANE_EVIDENCE, COLOR_EVIDENCE = 4.0, 1.5  # largest log odds of a pixel, before the plane and elsewhere
+COVERED = 0.5  # probability that a pixel shows the object although a point behind or before it is empty
+GRIDS = 64, 96  # cells along the volume's side, first and last
+LEAST_SEEN = 0.5  # fraction of the views that must show a cell
+VOLUME_SIDE = 2.0, 1.15  # sides of the volume over those of the object so far, first and last
+PRIOR_INSIDE, PRIOR_OUTSIDE = 3.0, 6.0  # largest log odds by the distance in pixels from the volume's silhouette
+CERTAIN = 3.0  # log odds from which GrabCut keeps a pixel
+LIMIT_PIXELS = 12  # around the silhouette: farther out nothing is the object
+
+
+@dataclass(frozen=True)
+class _Small:
+    """A view with its image at COARSE_SIDE."""
+
+    view: View
+    image: np.ndarray  # (H, W, 3) uint8
+    scale: float
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        pixels, depth = self.view.project(points)
+        return pixels * self.scale, depth
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """Two directions in the support plane and its normal, rows of ``axes``, about ``origin`` in it."""
+
+    origin: np.ndarray
+    axes: np.ndarray
+
+    @staticmethod
+    def of(plane: Plane, center: np.ndarray) -> _Axes:
+        u = np.cross(plane.normal, np.eye(3)[np.abs(plane.normal).argmin()])
+        u /= np.linalg.norm(u)
+        return _Axes(plane.foot(center), np.stack([u, np.cross(plane.normal, u), plane.normal]))
+
+
+def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Masks by name of the views in ``masks``, which may lack parts of the object; unchanged without a support plane.
+
+    The log odds of a pixel, object over background, compare a mixture of Gaussians of the object's colors with the
+    plane's texture, or elsewhere with the colors around the object.  Of each cell of a volume they give the log odds
+    that it is occupied (Franco and Boyer 2005): one view that sees the background through a cell empties it, and all
+    have to agree on an occupied one.  The volume's silhouettes are added to the log odds of the pixels, and GrabCut
+    starts there.
+    """
+    if scene.plane is None:
+        return masks
+    axes = _Axes.of(scene.plane, scene.center)
+    smalls = [_Small(v, *reduced(v.photo.pixels, COARSE_SIDE)) for v in found.views if v.photo.name in masks]
+    inside = [full_size(masks[s.view.photo.name], s.image.shape) > 127 for s in smalls]
+    points = (found.points[scene.object] - axes.origin) @ axes.axes.T
+    box = np.stack([np.minimum(points.min(0), [np.inf, np.inf, 0]), points.max(0)])
+    for cells, growth in zip(GRIDS, VOLUME_SIDE, strict=True):
+        texture = _plane_texture(smalls, inside, axes, scene)
+        expected = [_expected(texture, axes, s) for s in smalls]
+        evidence = _evidence(smalls, inside, expected)
+        occupied, cell = _occupied(smalls, evidence, axes, box, points, cells, growth)
+        if len(occupied) == 0:
+            return masks
+        box = np.stack([occupied.min(0), occupied.max(0)])
+        occupied = occupied @ axes.axes + axes.origin
+        inside = [_segmented(s, e, occupied, cell) for s, e in zip(smalls, evidence, strict=True)]
+    pixels = [(s.view.photo.name, s.view.photo.pixels) for s in smalls]
+    return {
+        name: full_size(refined(image, mask.astype(np.uint8) * 255), image.shape)
+        for (name, image), mask in zip(pixels, inside, strict=True)
+    }
+
+
+@dataclass(frozen=True)
+class _Texture:
+    """Colors ``(N, N, 3)`` of squares of the plane about the origin of its axes, and their spread ``(N, N)``."""
+
+    cell: float
+    color: np.ndarray
+    spread: np.ndarray
+
+
+def _plane_texture(smalls: Sequence[_Small], inside: Sequence[np.ndarray], axes: _Axes, scene: Scene) -> _Texture:
+    """Median over views, after one gain for each view and channel, of what they show outside the masks."""
+    cell = TEXEL * scene.distance / float(np.median([s.view.focal * s.scale for s in smalls]))
+    count = int(2 * TEXTURE_REACH * scene.distance / cell)
+    at = (np.arange(count) + 0.5 - count / 2) * cell
+    grid = np.stack([*np.meshgrid(at, at)], -1).reshape(-1, 2) @ axes.axes[:2] + axes.origin
+    samples = []
+    for small, mask in zip(smalls, inside, strict=True):
+        margin = 2 * round(COVER_MARGIN * max(mask.shape)) + 1
+        covered = cv2.dilate(mask.astype(np.uint8), np.ones((margin, margin), np.uint8))
+        pixels, depth = small.project(grid)
+        x, y = (pixels.T - 0.5).astype(np.float32).reshape(2, count, count)
+        color = cv2.remap(small.image, x, y, cv2.INTER_LINEAR).astype(np.float32)
+        free = cv2.remap(1 - covered, x, y, cv2.INTER_NEAREST, borderValue=0) > 0
+        color[~free | (depth.reshape(count, count) <= 0)] = np.nan
+        samples.append(color)
+    stack = np.stack(samples)  # (V, N, N, 3)
+    reference = _median(stack[:: -(-len(stack) // TEXTURE_VIEWS)])
+    stack /= np.stack([_gain(s, reference) for s in stack])[:, None, None]
+    color = _median(stack)
+    stack -= color
+    spread = 1.4826 * _median(np.abs(stack, out=stack)).max(-1)
+    known = np.count_nonzero(~np.isnan(stack[..., 0]), axis=0) >= FEWEST_SAMPLES
+    spread = np.where(known, np.maximum(spread, LEAST_SPREAD), 10 * MOST_SPREAD).astype(np.float32)
+    return _Texture(cell, np.nan_to_num(color), spread)
+
+
+def _median(stack: np.ndarray) -> np.ndarray:
+    return torch.from_numpy(stack).nanmedian(0).values.numpy()
+
+
+def _gain(color: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    ratio = (color / np.maximum(reference, DARKEST)).reshape(-1, 3)
+    return np.nan_to_num(_median(ratio), nan=1.0).clip(0.2, 5.0)
+
+
+@dataclass(frozen=True)
+class _Expected:
+    """The plane as a view shows it: lowest and highest color ``(H, W, 3)`` within a pixel, and spread ``(H, W)``."""
+
+    low: np.ndarray
+    high: np.ndarray
+    spread: np.ndarray
+    known: np.ndarray  # (H, W) bool
+
+    def away(self, image: np.ndarray, gain: np.ndarray | float) -> np.ndarray:
+        """Distance ``(H, W, 3)`` of the colors of ``image`` from the plane's."""
+        return np.maximum(np.maximum(image - self.high * gain, self.low * gain - image), 0.0)
+
+
+def _expected(texture: _Texture, axes: _Axes, small: _Small) -> _Expected:
+    h, w = small.image.shape[:2]
+    y, x = (np.mgrid[:h, :w] + 0.5) / small.scale
+    rays = small.view.rays(np.stack([x, y], -1).reshape(-1, 2)) @ axes.axes.T
+    eye = axes.axes @ (small.view.eye - axes.origin)
+    along = -eye[2] / np.where(np.abs(rays[:, 2]) > 1e-9, rays[:, 2], 1e-9)
+    hit = (eye[:2] + along[:, None] * rays[:, :2]) / texture.cell + len(texture.color) / 2 - 0.5
+    hit[along <= 0] = -10
+    u, v = hit.T.astype(np.float32).reshape(2, h, w)
+    color = cv2.remap(texture.color, u, v, cv2.INTER_LINEAR)
+    spread = cv2.remap(texture.spread, u, v, cv2.INTER_LINEAR, borderValue=10 * MOST_SPREAD)
+    window = np.ones((3, 3), np.uint8)
+    known = spread < MOST_SPREAD
+    return _Expected(cv2.erode(color, window), cv2.dilate(color, window), np.maximum(spread, LEAST_SPREAD), known)
+
+
+class _Colors:
+    """A mixture of Gaussians of colors ``(N, 3)``, one for each of COMPONENTS clusters."""
+
+    def __init__(self, colors: np.ndarray) -> None:
+        some = colors[np.random.default_rng(0).permutation(len(colors))[:COLOR_SAMPLES]].astype(np.float32)
+        cv2.setRNGSeed(0)
+        count = min(COMPONENTS, len(some))
+        label = np.zeros((len(some), 1), np.int32)
+        cv2.kmeans(some, count, label, (3, 10, 1.0), 1, cv2.KMEANS_PP_CENTERS)
+        self.parts = []
+        for k in range(count):
+            part = some[label[:, 0] == k]
+            covariance = np.cov(part.T) if len(part) > 3 else np.zeros((3, 3))
+            covariance = covariance + COLOR_NOISE**2 * np.eye(3)
+            constant = np.log(len(part) / len(some)) - 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]
+            self.parts.append((part.mean(0), np.linalg.inv(covariance).astype(np.float32), np.float32(constant)))
+
+    def log_density(self, image: np.ndarray) -> np.ndarray:
+        flat = image.reshape(-1, 3).astype(np.float32)
+        found = np.full(len(flat), LOWEST_DENSITY, np.float32)
+        for middle, inverse, constant in self.parts:
+            away = flat - middle
+            found = np.logaddexp(found, constant - 0.5 * ((away @ inverse) * away).sum(1))
+        return found.reshape(image.shape[:2])
+
+
+def _evidence(
+    smalls: Sequence[_Small], inside: Sequence[np.ndarray], expected: Sequence[_Expected]
+) -> list[np.ndarray]:
+    """Log odds ``(H, W)`` of the pixels of each view: object over background."""
+    samples = []
+    for small, mask, plane in zip(smalls, inside, expected, strict=True):
+        core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        unlike = plane.away(small.image, 1.0).max(-1) > UNLIKE_PLANE * plane.spread
+        samples.append(small.image[core & (unlike | ~plane.known)])
+    own = _Colors(np.concatenate(samples))
+    return [_log_odds(s.image, m, plane, own) for s, m, plane in zip(smalls, inside, expected, strict=True)]
+
+
+def _log_odds(image: np.ndarray, inside: np.ndarray, plane: _Expected, own: _Colors) -> np.ndarray:
+    near, around = (cv2.dilate(inside.astype(np.uint8), np.ones((k, k), np.uint8)) > 0 for k in NEAR_AND_AROUND)
+    sample, gain = ~near & plane.known, np.ones(3)
+    if sample.sum() > FEWEST_PIXELS:
+        middle = (plane.low + plane.high)[sample] / 2
+        gain = np.median(image[sample] / np.maximum(middle, DARKEST), 0)
+    context = around & ~near
+    other = _Colors(image[context if context.sum() > FEWEST_PIXELS else ~inside]).log_density(image)
+    as_plane = -0.5 * (plane.away(image, gain) ** 2).sum(-1) / plane.spread**2
+    as_plane -= 3 * np.log(plane.spread) + 1.5 * np.log(2 * np.pi)
+    as_plane = np.logaddexp(np.log(1 - SHADOWS) + as_plane, np.log(SHADOWS) + other)
+    odds = own.log_density(image) - np.where(plane.known, as_plane, other)
+    limit = np.where(plane.known, PLANE_EVIDENCE, COLOR_EVIDENCE)
+    return np.clip(cv2.GaussianBlur(np.clip(odds, -8, 8), (0, 0), 1.2), -limit, limit)
+
+
+def _occupied(smalls, evidence, axes: _Axes, box, points, cells: int, growth: float) -> tuple[np.ndarray, float]:
+    """Centers ``(N, 3)``, in ``axes``, of the occupied cells that hang together with ``points``, and their size."""
+    middle, side = box.mean(0), growth * float((box[1] - box[0]).max())
+    middle[2] = max(middle[2], side / 2 - 0.05 * side)  # hardly any of it below the plane
+    cell = side / cells
+    at = (np.arange(cells) + 0.5 - cells / 2) * cell
+    grid = np.stack(np.meshgrid(at, at, at, indexing="ij"), -1) + middle
+    flat = grid.reshape(-1, 3) @ axes.axes + axes.origin
+    odds, seen = np.zeros(len(flat)), np.zeros(len(flat))
+    for small, e in zip(smalls, evidence, strict=True):
+        pixels, depth = small.project(flat)
+        x, y = np.floor(pixels).astype(np.int64).T
+        shown = (depth > 0) & (x >= 0) & (y >= 0) & (x < e.shape[1]) & (y < e.shape[0])
+        odds[shown] -= np.log(COVERED + (1 - COVERED) * np.exp(-e[y[shown], x[shown]]))
+        seen += shown
+    full = (odds > 0) & (seen >= LEAST_SEEN * len(smalls)) & (grid[..., 2].ravel() > 0)
+    label, count = ndimage.label(full.reshape(grid.shape[:3]))
+    if count == 0:
+        return np.zeros((0, 3)), cell
+    index = np.floor((points - middle) / cell + cells / 2).astype(int)
+    index = index[((index >= 0) & (index < cells)).all(1)]
+    votes = np.bincount(label[tuple(index.T)], minlength=count + 1)
+    votes[0] = 0
+    sizes = np.bincount(label.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    best = votes.argmax() if votes.max() > 0 else sizes.argmax()
+    return grid[label == best], cell
+
+
+def _segmented(small: _Small, evidence: np.ndarray, occupied: np.ndarray, cell: float) -> np.ndarray:
+    """Mask ``(H, W)`` by GrabCut, which starts from the evidence and the silhouette of the occupied cells."""
+    h, w = evidence.shape
+    pixels, depth = small.project(occupied)
+    x, y = np.floor(pixels).astype(np.int64).T
+    shown = (depth > 0) & (x >= 0) & (y >= 0) & (x < w) & (y < h)
+    silhouette = np.zeros((h, w), np.uint8)
+    silhouette[y[shown], x[shown]] = 1
+    if not shown.any():
+        return silhouette > 0
+    width = int(np.ceil(small.view.focal * small.scale * cell / np.median(depth[shown]))) + 2
+    closed = cv2.morphologyEx(silhouette, cv2.MORPH_CLOSE, np.ones((width, width), np.uint8))
+    away = cv2.distanceTransform(closed, cv2.DIST_L2, 3) - cv2.distanceTransform(1 - closed, cv2.DIST_L2, 3)
+    odds = evidence + np.clip(away, -PRIOR_OUTSIDE, PRIOR_INSIDE)
+    labels = np.where(odds > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    labels[odds > CERTAIN], labels[odds < -CERTAIN] = cv2.GC_FGD, cv2.GC_BGD
+    limit = (away > -LIMIT_PIXELS).astype(np.uint8)
+    labels[limit == 0] = cv2.GC_BGD
+    return grabcut(small.image, labels, limit) > 0

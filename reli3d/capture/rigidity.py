@@ -1,0 +1,125 @@
+"""Whether a map fits the matches inside the masks, and how an object was moved between the views of two maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from reli3d.capture.mapping import Map, View
+
+EPIPOLAR_ERROR = 0.002  # of the longer side: Sampson distance up to which a match fits an essential matrix
+FEWEST_MATCHES = 20  # of a pair of views
+CONFIDENCE = 0.999  # of RANSAC
+GROUP_TURN = np.cos(np.radians(3.0))  # between rotations of the views of a group
+GROUP_ERROR = 0.02  # of the distance to the middle of the cameras, of positions in a group
+SMALLEST_GROUP = 3  # views
+
+
+def epipolar_fit(found: Map, masks: dict[str, np.ndarray], *, inside: bool = True) -> float:
+    """Matches inside the masks that fit the cameras of ``found``, over those that fit one essential matrix for each
+    pair of views, found by RANSAC.
+
+    About 1 where the object did not move relative to what the map consists of.  Where it was moved the matches of a
+    pair still fit an essential matrix of their own, but not that of the map's cameras.  inside: False takes the matches
+    outside the masks instead.  1 without matches.
+    """
+    fitting, best = 0, 0
+    for a, b, pixels_a, pixels_b in found.matches:
+        first, second = found.views[a], found.views[b]
+        if first.photo.name not in masks or second.photo.name not in masks:
+            continue
+        kept = (_inside(masks[first.photo.name], pixels_a) == inside) & (
+            _inside(masks[second.photo.name], pixels_b) == inside
+        )
+        if kept.sum() < FEWEST_MATCHES:
+            continue
+        x, y = first.normalized(pixels_a[kept]), second.normalized(pixels_b[kept])
+        limit = EPIPOLAR_ERROR * max(first.photo.size) / min(first.focal, second.focal)
+        cv2.setRNGSeed(0)
+        _, own = cv2.findEssentialMat(x, y, np.eye(3), cv2.RANSAC, CONFIDENCE, limit)
+        best += 0 if own is None else int(np.count_nonzero(own))
+        fitting += int((_sampson(x, y, _essential(first, second)) < limit).sum())
+    return fitting / best if best else 1.0
+
+
+def _inside(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    x, y = np.clip(pixels.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
+    return mask[y, x] > 127
+
+
+def _essential(a: View, b: View) -> np.ndarray:
+    turn = b.rotation @ a.rotation.T
+    x, y, z = b.translation - turn @ a.translation
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turn
+
+
+def _sampson(x: np.ndarray, y: np.ndarray, essential: np.ndarray) -> np.ndarray:
+    """First-order distance ``(N,)`` of pairs of normalized coordinates ``(N, 2)`` from ``y^T E x = 0``."""
+    x, y = (np.concatenate([p, np.ones((len(p), 1))], 1) for p in (x, y))
+    line, other = x @ essential.T, y @ essential
+    slope = (line[:, :2] ** 2).sum(1) + (other[:, :2] ** 2).sum(1)
+    return np.abs((y * line).sum(1)) / np.sqrt(np.maximum(slope, 1e-30))
+
+
+@dataclass(frozen=True)
+class Group:
+    """Views, by name, that are related by one similarity ``x -> scale (turn x) + shift`` from a map to another."""
+
+    names: tuple[str, ...]
+    scale: float
+    turn: np.ndarray  # (3, 3)
+    shift: np.ndarray  # (3,)
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """``points (..., 3)`` in the other map."""
+        return self.scale * points @ self.turn.T + self.shift
+
+    def moved(self, view: View) -> View:
+        """The view's pose in the other map."""
+        rotation = view.rotation @ self.turn.T
+        return replace(view, rotation=rotation, translation=-rotation @ self.apply(view.eye))
+
+
+def rigid_groups(first: Map, second: Map) -> list[Group]:
+    """Groups of views, the largest first, within which ``second`` is ``first`` but for a similarity.
+
+    A map of the surroundings and one of the object have one for each place at which the object was.  Views that belong
+    to no other SMALLEST_GROUP - 1 are in none.
+    """
+    by_name = {v.photo.name: v for v in first.views}
+    pairs = [(by_name[v.photo.name], v) for v in second.views if v.photo.name in by_name]
+    groups: list[Group] = []
+    while len(pairs) >= SMALLEST_GROUP:
+        a, b = (np.stack([p[k].eye for p in pairs]) for k in (0, 1))
+        turns = np.stack([p[1].rotation.T @ p[0].rotation for p in pairs])
+        limit = GROUP_ERROR * float(np.median(np.linalg.norm(b - b.mean(0), axis=1)))
+        best = np.zeros(len(pairs), bool)
+        alike = (np.einsum("iab,jab->ij", turns, turns) - 1) / 2 > GROUP_TURN
+        for i in range(len(pairs)):
+            for j in alike[i].nonzero()[0]:
+                if (base := float(np.linalg.norm(a[j] - a[i]))) < 1e-9:
+                    continue
+                scale = float(np.linalg.norm(b[j] - b[i])) / base
+                away = np.linalg.norm(scale * (a - a[i]) @ turns[i].T - (b - b[i]), axis=1)
+                if (fits := alike[i] & (away < 2 * limit)).sum() > best.sum():
+                    best = fits
+        if best.sum() < SMALLEST_GROUP:
+            break
+        scale, turn, shift = _similarity(a[best], b[best])
+        if np.median(np.linalg.norm(scale * a[best] @ turn.T + shift - b[best], axis=1)) > limit:
+            break
+        groups.append(Group(tuple(p[0].photo.name for p, k in zip(pairs, best, strict=True) if k), scale, turn, shift))
+        pairs = [p for p, k in zip(pairs, best, strict=True) if not k]
+    return groups
+
+
+def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation and shift that take the points ``a (N, 3)`` to ``b`` with the least squares (Umeyama 1991)."""
+    a0, b0 = a.mean(0), b.mean(0)
+    u, s, vt = np.linalg.svd((b - b0).T @ (a - a0))
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    turn = u @ sign @ vt
+    scale = float((s * np.diag(sign)).sum() / ((a - a0) ** 2).sum())
+    return scale, turn, b0 - scale * turn @ a0

@@ -1,0 +1,62 @@
+"""Masks of an object whose color is that of the background, from the texture of its support and from all views."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from reli3d.capture.fusion import fused_masks
+from reli3d.capture.mapping import Map, View
+from reli3d.capture.photos import Photo
+from reli3d.capture.scene import Plane, Scene
+from tests.capture.test_rigidity import view
+
+RADIUS, GRAY = 0.35, 90.0
+
+
+def pictured(k: int, eye: np.ndarray, texture: np.ndarray) -> tuple[View, np.ndarray]:
+    """A gray ball on a textured plane ``z = -RADIUS`` before a wall of the same gray, and its mask, by ray casting."""
+    camera = view(k, eye)
+    w, h = camera.photo.size
+    y, x = np.mgrid[:h, :w] + 0.5
+    rays = camera.rays(np.stack([x, y], -1).reshape(-1, 2))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    along = rays @ eye
+    ball = (along**2 - (eye @ eye - RADIUS**2) > 0) & (along < 0)
+    depth = (-RADIUS - eye[2]) / np.minimum(rays[:, 2], -1e-9)
+    at = (eye[:2] + depth[:, None] * rays[:, :2]) * 100 + 200
+    on_plane = (rays[:, 2] < 0) & (np.abs(at - 200) < 180).all(1) & ~ball
+    image = np.full((h * w, 3), GRAY)
+    u, v = np.where(on_plane, at.T, 0.0).astype(np.float32).reshape(2, h, w)
+    image[on_plane] = cv2.remap(texture, u, v, cv2.INTER_LINEAR).reshape(-1, 3)[on_plane]
+    image = image.reshape(h, w, 3) + np.random.default_rng(k).normal(0, 3, (h, w, 3))
+    photo = Photo(str(k), image.clip(0, 255).astype(np.uint8), None, ())
+    mask = ball.reshape(h, w)
+    return View(
+        photo, camera.rotation, camera.translation, camera.focal, camera.principal, 0.0, camera.pixels, camera.points
+    ), mask
+
+
+def test_masks_that_lack_half_of_a_gray_object_are_completed():
+    rng = np.random.default_rng(0)
+    texture = cv2.resize(rng.uniform(0, 255, (100, 100, 3)).astype(np.float32), (400, 400))
+    pairs = []
+    for k in range(10):
+        azimuth, elevation = 2 * np.pi * k / 10, np.radians(20 if k % 2 else 50)
+        direction = np.array([np.cos(azimuth), np.sin(azimuth), 0]) * np.cos(elevation)
+        pairs.append(pictured(k, 2.4 * (direction + [0, 0, np.sin(elevation)]), texture))
+    views, truth = zip(*pairs, strict=True)
+    points = rng.normal(size=(300, 3))
+    points *= 0.98 * RADIUS / np.linalg.norm(points, axis=1, keepdims=True)
+    found = Map(views, points, np.zeros(300), np.full(300, 3))
+    scene = Scene(np.zeros(3), 2.4, Plane(np.array([0.0, 0, 1]), RADIUS), np.ones(300, bool), np.zeros(300, bool))
+    masks = {}
+    for v, mask in pairs:
+        half = mask.copy()
+        half[:, mask.any(0).nonzero()[0].mean().astype(int) :] &= int(v.photo.name) % 3 > 0  # every third lacks half
+        masks[v.photo.name] = half.astype(np.uint8) * 255
+    result = fused_masks(found, scene, masks)
+    iou = [(r & t).sum() / (r | t).sum() for t, r in ((t, result[v.photo.name] > 127) for v, t in pairs)]
+    assert (
+        min(iou) > 0.88 and np.mean(iou) > 0.94
+    )  # before the wall only the hull of the higher views shows the outline

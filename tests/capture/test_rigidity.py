@@ -1,0 +1,96 @@
+"""Objects that were moved between views: epipolar fit of matches, and groups of views with one rigid motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from reli3d.capture.mapping import Map, View
+from reli3d.capture.photos import Photo
+from reli3d.capture.rigidity import epipolar_fit, rigid_groups
+
+SIZE = 400, 300
+
+
+def view(k: int, eye: np.ndarray, radial: float = 0.0) -> View:
+    """A camera at ``eye`` that looks at the origin, +Z of the world up."""
+    forward = -eye / np.linalg.norm(eye)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    photo = Photo(str(k), np.zeros((SIZE[1], SIZE[0], 3), np.uint8), None, ())
+    principal = np.array(SIZE) / 2 + (3, -2)
+    return View(photo, rotation, -rotation @ eye, 500.0, principal, radial, np.zeros((0, 2)), np.zeros(0, np.int64))
+
+
+def ring(count: int = 12) -> list[View]:
+    azimuth = 2 * np.pi * np.arange(count) / count
+    return [view(k, 3.0 * np.array([np.cos(a), np.sin(a), 0.5 + 0.2 * (k % 2)])) for k, a in enumerate(azimuth)]
+
+
+def turned(points: np.ndarray, degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return points @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [0.2, 0.1, 0]
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_matches_on_a_moved_object_do_not_fit_the_cameras(moved):
+    rng = np.random.default_rng(0)
+    views, points = ring(), rng.uniform(-0.3, 0.3, (60, 3))
+    surroundings = rng.uniform(-0.9, 0.9, (60, 3)) * (1, 1, 0.02) - (0, 0, 0.5)
+    pixels, masks = [], {}
+    for k, v in enumerate(views):
+        shown = v.project(turned(points, 30) if moved and k >= 6 else points)[0]
+        mask = np.zeros(SIZE[::-1], np.uint8)
+        cv2.fillConvexPoly(mask, np.rint(cv2.convexHull(shown.astype(np.float32))).astype(np.int32), 255)
+        masks[v.photo.name] = cv2.dilate(mask, np.ones((5, 5), np.uint8))
+        both = np.concatenate([shown, v.project(surroundings)[0]])
+        pixels.append(both + rng.normal(0, 0.1, both.shape))
+    matches = tuple((a, b, pixels[a], pixels[b]) for b in range(12) for a in range(b))
+    found = Map(tuple(views), np.zeros((0, 3)), np.zeros(0), np.zeros(0), matches)
+    fit = epipolar_fit(found, masks)
+    assert fit < 0.75 if moved else fit > 0.97  # 36 of 66 pairs are across the motion
+    assert epipolar_fit(found, masks, inside=False) > 0.97
+
+
+def test_groups_of_views_have_the_motions_of_the_object():
+    """The second map is the first, seen from the object: one similarity before the object was moved, and another."""
+    first = ring()
+    rng, turns = np.random.default_rng(1), []
+    for _ in range(2):
+        q = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        turns.append(q * np.sign(np.linalg.det(q)))
+    shifts, second = ([1.0, -2.0, 0.5], [0.3, 0.2, 4.0]), []
+    for k, v in enumerate(first):
+        turn, shift = turns[k >= 7], np.array(shifts[k >= 7])
+        rotation = v.rotation @ turn.T
+        second.append(replace(v, rotation=rotation, translation=-rotation @ (2.5 * turn @ v.eye + shift)))
+    empty = np.zeros((0, 3)), np.zeros(0), np.zeros(0)
+    groups = rigid_groups(Map(tuple(first), *empty), Map(tuple(second), *empty))
+    assert [len(g.names) for g in groups] == [7, 5]
+    for group, turn, shift in zip(groups, turns, shifts, strict=True):
+        assert group.scale == pytest.approx(2.5) and np.allclose(group.turn, turn) and np.allclose(group.shift, shift)
+        for name in group.names:
+            pose = group.moved(first[int(name)])
+            assert np.allclose(pose.rotation, second[int(name)].rotation) and np.allclose(
+                pose.eye, second[int(name)].eye
+            )
+    noisy = [replace(v, translation=v.translation + rng.normal(0, 1.0, 3)) for v in second]
+    assert not [g for g in rigid_groups(Map(tuple(first), *empty), Map(tuple(noisy), *empty)) if len(g.names) > 4]
+
+
+def test_normalized_coordinates_undo_the_lens():
+    """Against OpenCV's model of the lens."""
+    v = view(0, np.array([3.0, 0.4, 1.0]), radial=-0.12)
+    points = np.random.default_rng(2).uniform(-0.6, 0.6, (50, 3))
+    matrix = np.array([[v.focal, 0, v.principal[0]], [0, v.focal, v.principal[1]], [0, 0, 1]])
+    lens = np.array([v.radial, 0.0, 0.0, 0.0])
+    pixels = cv2.projectPoints(points, cv2.Rodrigues(v.rotation)[0], v.translation, matrix, lens)[0][:, 0]
+    assert np.allclose(v.project(points)[0], pixels)
+    local = points @ v.rotation.T + v.translation
+    assert np.allclose(v.normalized(pixels), local[:, :2] / local[:, 2:], atol=1e-6)  # fixed-point iteration
+    rays = v.rays(pixels)
+    assert np.allclose(np.cross(rays, points - v.eye), 0, atol=1e-5)
