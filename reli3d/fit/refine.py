@@ -100,9 +100,9 @@ def refine(
     with ``steps`` the result is deterministic on one machine.  resolution: grid cells along the longest side, raised
     automatically for thin objects (:func:`~reli3d.fit.shape.start_grid`).  weights: loss weights; None: the defaults.
     cameras: optimize the camera poses as well.  light: ``object``, fixed to the object; ``camera``, moving with the
-    camera (a turntable or a flash); or names per view; equal ones share lighting.  For the last two, the result's
-    environment is the lighting of view 0.  seed: random seed.  bar: show progress on stderr.  interrupt: called before
-    every step; once it returns True the fit ends with the best result so far.
+    camera (a turntable or a flash); or names per view; equal ones share lighting.  Unless ``object``, the result has
+    the lighting of view 0.  seed: random seed.  bar: show progress on stderr.  interrupt: called before every step;
+    once it returns True the fit ends with the best result so far.
 
     With three or more views some are held out (:func:`held_out`): their masks are used, their colors only to select
     which parts of the fit are kept (:func:`~reli3d.fit.choice.chosen`).  The inputs are detached: no gradient reaches

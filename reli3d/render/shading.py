@@ -264,7 +264,7 @@ def struct_of_points(values: Sequence[Tensor], pixels: Tensor) -> kernels.Points
 
 
 def struct_of_light(radiance: Tensor, cdf: EnvironmentCDF, offsets: Tensor) -> kernels.Light:
-    """Contiguous texels, their sampling CDF, and the low-discrepancy points, rotated per hit."""
+    """Contiguous texels, their sampling CDF, and the low-discrepancy points, not yet rotated."""
     rows, columns, row_guide, column_guide = cdf.sampler
     return struct_of(
         kernels.Light,
