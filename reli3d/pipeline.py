@@ -357,10 +357,10 @@ def reconstruct(views: Views, *, weights: str | Network = "small", device: str =
     ``cpu`` or ``cuda``, ignored for a loaded network; the asset is on the network's device.  options: see
     :class:`ReconstructOptions`.  watch: receives the seconds of each stage.
 
-    The asset is in the cameras' world frame and units, with ``options.up`` made +Y.  Deterministic.  Runs under
-    ``torch.no_grad``, so nothing has gradients; :func:`refine` optimizes the result.  Raises TypeError unless ``views``
-    are Views; InputError if the masks' visual hull is empty, or for weights that cannot be read; NoSurface, an
-    InputError, if the network predicts no surface.  Source: the ReLi3D paper, ICLR 2026.
+    The asset is in the world frame and units of the cameras, rotated so that ``options.up`` is +Y.  Deterministic.
+    Runs under ``torch.no_grad``, so nothing has gradients; :func:`refine` optimizes the result.  Raises TypeError
+    unless ``views`` are Views; InputError if the masks' visual hull is empty, or for weights that cannot be read;
+    NoSurface, an InputError, if the network predicts no surface.  Source: the ReLi3D paper, ICLR 2026.
 
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe", views=4))
     >>> reli3d.write_glb("shoe.glb", asset)

@@ -26,7 +26,7 @@ class TextureSet:
     """Metallic-roughness textures of one mesh: square float32 maps of equal size, with values in [0, 1].
 
     Row 0 is v = 0 (glTF: v down), texel centers at +0.5.  base_color: ``(T, T, 3)``, linear; files hold sRGB.
-    roughness (perceptual), metallic: ``(T, T)``, ``(T, T, 1)``, or a Python number, without gradient; to optimize one
+    roughness (perceptual), metallic: ``(T, T)``, ``(T, T, 1)``, or a Python number (no gradient); to optimize one
     value for the whole map, pass a scalar tensor expanded to ``(T, T)``.  normal: ``(T, T, 3)``, tangent-space unit
     normals ``n`` encoded as ``n * 0.5 + 0.5``, green along the bitangent; None: flat.  wrap: wrap modes along u and v
     for UV outside [0, 1], each ``repeat``, ``mirror`` or ``clamp``.  After construction all maps are tensors.
