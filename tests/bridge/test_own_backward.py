@@ -6,30 +6,18 @@ import torch
 
 from reli3d.render import shading, volume
 from reli3d.render.environment import Environment
-from reli3d.render.shading import shade
 from reli3d.render.volume import composite
 from tests.support.op_cases import shaded
 from tests.support.rays import packed
-from tests.support.surfaces import at
+from tests.support.surfaces import at, lit
 
 NAMES = ("normal", "base_color", "roughness", "metallic", "radiance")
 
 
-def lit(leaves, pixels=None):
+def shown(leaves):
     """Radiance of the table's hits; ``leaves`` by name, with all that ``shade`` takes."""
-    return shade(
-        *at(
-            leaves["normal"].detach(),
-            leaves["normal"],
-            leaves["ng"],
-            leaves["wo"],
-            leaves["base_color"],
-            leaves["roughness"],
-            leaves["metallic"],
-        ),
-        Environment(leaves["radiance"]),
-        pixels=pixels,
-    )
+    names = ("normal", "ng", "wo", "base_color", "roughness", "metallic")
+    return lit(at(leaves["normal"].detach(), *(leaves[k] for k in names)), Environment(leaves["radiance"]))
 
 
 def hits(device, required=NAMES):
@@ -55,19 +43,16 @@ def watched(monkeypatch, module, kernel):
 @pytest.mark.parametrize("required", [*((name,) for name in NAMES), ("base_color", "radiance")])
 def test_shade_computes_only_required_gradients(device, monkeypatch, required):
     every = hits(device)
-    expected_grads = dict(
-        zip(NAMES, torch.autograd.grad(lit(every).square().sum(), [every[k] for k in NAMES]), strict=True)
-    )
+    grads = torch.autograd.grad(shown(every).square().sum(), [every[k] for k in NAMES])
+    expected_grads = dict(zip(NAMES, grads, strict=True))
     rows = watched(monkeypatch, shading, "shade_adjoint_kernel")
     leaves = hits(device, required)
-    lit(leaves).square().sum().backward()
-    assert rows and all(
-        [k for k, count in zip(NAMES, row[-5:], strict=True) if count] == list(required) for row in rows
-    )
+    shown(leaves).square().sum().backward()
+    written = [[k for k, count in zip(NAMES, row[-5:], strict=True) if count] for row in rows]
+    assert rows and all(names == list(required) for names in written)
     for k in required:
-        torch.testing.assert_close(
-            leaves[k].grad, expected_grads[k], rtol=1e-5, atol=1e-6 * float(expected_grads[k].abs().max())
-        )
+        expected = expected_grads[k]
+        torch.testing.assert_close(leaves[k].grad, expected, rtol=1e-5, atol=1e-6 * float(expected.abs().max()))
 
 
 @pytest.mark.parametrize("required", [(True, False), (False, True)])

@@ -39,8 +39,12 @@ def images(start):
     return InputImages.of(small_scene.input_views(wavy, VIEWS, SIZE))
 
 
-def fitted(start, images, weights: Weights, steps: int = 40) -> Unknowns:
-    unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
+def unchanged() -> Unknowns:
+    return Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
+
+
+def fitted(start, images, weights: Weights, steps: int = 40, unknowns: Unknowns | None = None) -> Unknowns:
+    unknowns = unknowns or unchanged()
     views, budget = list(range(VIEWS)), Budget(steps=steps)
     none = torch.zeros_like(start.mesh.vertices)
     data = FixedSurface(Start.of(start), start, none, images, views)
@@ -50,9 +54,7 @@ def fitted(start, images, weights: Weights, steps: int = 40) -> Unknowns:
 
 def patches(asset) -> float:
     """Standard deviation of the logarithm of the base color over the faces."""
-    face = torch.arange(len(asset.mesh.faces), dtype=torch.int32)
-    at = surface_points(asset.mesh, asset.textures, face, torch.full((len(face), 2), 1 / 3))
-    return float(at.base_color.log().std(0).mean())
+    return float(small_scene.centers(asset).base_color.log().std(0).mean())
 
 
 def test_waves_of_the_normals_are_baked_into_the_base_color_less(start, images):
@@ -66,8 +68,7 @@ def test_waves_of_the_normals_are_baked_into_the_base_color_less(start, images):
 
 def hue(asset) -> torch.Tensor:
     """Mean logarithm of the base color ``(3,)`` without its brightness."""
-    face = torch.arange(len(asset.mesh.faces), dtype=torch.int32)
-    color = surface_points(asset.mesh, asset.textures, face, torch.full((len(face), 2), 1 / 3)).base_color.log().mean(0)
+    color = small_scene.centers(asset).base_color.log().mean(0)
     return color - color.mean()
 
 
@@ -82,7 +83,7 @@ def test_a_light_of_another_color_leaves_the_hue_of_the_base_color(start, images
 
 
 def test_the_bend_is_written_into_the_normal_map(start):
-    unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
+    unknowns = unchanged()
     unknowns.bend[0] += torch.tensor([0.3, 0.0, 0.0])
     asset = changed(start, unknowns)
     found = rasterize_texels(asset.mesh, small_scene.TEXELS)
@@ -99,7 +100,7 @@ def test_the_bend_is_written_into_the_normal_map(start):
 
 def test_no_bend_turns_a_normal_away():
     # a normal turned to the dark side would explain a black base color
-    unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
+    unknowns = unchanged()
     unknowns.bend[0] += torch.tensor([1e3, 0.0, 0.0])
     normal = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     turned = bent(unknowns, torch.zeros(100, 3), normal)[0]
@@ -127,10 +128,8 @@ def test_the_material_is_frozen_while_the_kept_bend_is_fitted(start, images, mon
         seen.append((unknowns.material[0].clone(), unknowns.light[0].clone()))
 
     monkeypatch.setattr(Budget, "record", looking)
-    unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
-    budget, views, none = Budget(steps=20), list(range(VIEWS)), torch.zeros_like(start.mesh.vertices)
-    data = FixedSurface(Start.of(start), start, none, images, views)
-    maps.fit_maps(unknowns, data, Weights(), budget, STAGE, seed=0)
+    unknowns = unchanged()
+    fitted(start, images, Weights(), 20, unknowns)
     first = int(maps.MATERIAL_UNTIL * 20)
     assert not torch.equal(seen[first - 2][0], seen[first - 1][0])
     assert torch.equal(seen[first][0], seen[-1][0]) and not torch.equal(seen[first][1], seen[-1][1])

@@ -19,6 +19,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.points import SurfacePoints
 from tests.support import small_scene
+from tests.support.meshes import mesh_from
 
 COLOR = torch.tensor([0.5, 0.2, 0.05])  # linear
 COPIES = 401  # vertices at each distance: 13,000 rays
@@ -60,9 +61,9 @@ def test_a_floor_receives_the_view_factor_of_its_wall(device):
 
 
 def test_a_convex_body_receives_nothing_and_a_closed_box_one_color(device):
-    ball = trimesh.creation.icosphere(3)
-    vertices, faces = torch.tensor(ball.vertices).float(), torch.tensor(ball.faces).int()
-    outside, inside = Mesh(vertices, faces, vertices).to(device), Mesh(vertices, faces.flip(1), -vertices).to(device)
+    ball = mesh_from(trimesh.creation.icosphere(3), device)
+    vertices = ball.vertices
+    outside, inside = replace(ball, normals=vertices), Mesh(vertices, ball.faces.flip(1), -vertices)
     inputs = images((0.0, 0.0, 0.2), device)
     assert not gathered(outside, images((0.0, 0.0, 4.0), device), seed=0).any()
     torch.testing.assert_close(

@@ -10,7 +10,7 @@ from reli3d.fit import losses
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.shape import BAND_CELLS, THIN_WEIGHT, Grid, curvature_weight, start_grid
 from reli3d.geometry.camera import Camera
-from reli3d.geometry.mesh import Mesh
+from tests.support.meshes import mesh_from
 
 
 def box(points, low, high):
@@ -61,8 +61,7 @@ def test_descent_of_the_curvature_keeps_a_thin_sheet():
 
 
 def slab(depth):
-    box = trimesh.creation.box((1.8, 2.0, depth))
-    return Mesh(torch.tensor(box.vertices).float(), torch.tensor(box.faces).int())
+    return mesh_from(trimesh.creation.box((1.8, 2.0, depth)))
 
 
 def unbounded():

@@ -8,15 +8,14 @@ from reli3d.fit.unknowns import unit
 from reli3d.geometry.mesh import Mesh, face_normals, volume
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
+from tests.support.reference_surface import grid
 
 CELLS = 20
 
 
 def box(noise: float) -> Mesh:
     """A box of half side 0.6 between the points of a grid, whose signed distance has ``noise``, in cells."""
-    axis = torch.linspace(-1.0, 1.0, CELLS + 1)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    sdf = points.abs().amax(-1) - 0.63
+    sdf = grid(CELLS).abs().amax(-1) - 0.63
     sdf += noise * 2.0 / CELLS * torch.randn(sdf.shape, generator=torch.Generator().manual_seed(3))
     return extract_surface(sdf, radius=1.0)
 
@@ -50,9 +49,7 @@ def test_noise_goes_and_edges_stay():
 def test_planes_and_nothing_to_do_change_nothing():
     mesh = box(0.08)
     assert torch.equal(flattened(mesh, normal_iterations=0, vertex_iterations=0).vertices, mesh.vertices)
-    still = flattened(
-        mesh, normal_iterations=0
-    )  # each face already has its own normal, so no vertex is off its faces' planes
+    still = flattened(mesh, normal_iterations=0)  # no vertex is off the planes of its faces' own normals
     assert torch.allclose(still.vertices, mesh.vertices, atol=1e-6)
     empty = Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32))
     assert flattened(empty).vertices.shape == (0, 3)

@@ -18,6 +18,7 @@ from reli3d.fit.maps import FixedSurface
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.geometry.rays import RayScene
 from tests.support import small_scene
+from tests.support.differences import slopes
 
 SIZE = 40
 
@@ -84,23 +85,11 @@ def test_the_gradient_of_a_step_matches_central_differences(case, monkeypatch):
 
     monkeypatch.setattr(shape, "radiance", shown)
     values = unknowns.groups()[name]
-    directions = towards(kind, values)
 
     def loss() -> Tensor:
         return shape.shape_loss(unknowns, data, weights, progress=0.9, seed=1, independent=False)
 
-    for value in values:
-        value.requires_grad_(True)
-    gradients = torch.autograd.grad(loss(), values, allow_unused=True)
-    got = sum(float((g * d).sum()) for g, d in zip(gradients, directions, strict=True) if g is not None)
-    for value in values:
-        value.requires_grad_(False)
-    ends = []
-    for sign in (1.0, -2.0):
-        for value, direction in zip(values, directions, strict=True):
-            value += sign * step * direction
-        ends.append(float(loss().double()))
-    expected = (ends[0] - ends[1]) / (2.0 * step)
+    got, expected = slopes(loss, values, towards(kind, values), step)
     assert got == pytest.approx(expected, rel=tolerance)
 
 
@@ -114,21 +103,11 @@ def test_the_gradient_of_the_bend_matches_central_differences(terms, monkeypatch
     rng = torch.Generator().manual_seed(3)
     for grid in unknowns.bend:
         grid += 0.1 * torch.randn(grid.shape, generator=rng)
-    directions = towards("all", unknowns.bend)
     estimate = maps.Estimate(None, LIGHT, seed=1, independent=False)
 
     def loss() -> Tensor:
         weights = Weights(**{**NONE, **terms})
         return maps.maps_loss(unknowns, surface, pixels, pixels.order[:400], weights, estimate)
 
-    for grid in unknowns.bend:
-        grid.requires_grad_(True)
-    gradients = torch.autograd.grad(loss(), unknowns.bend)
-    got = sum(float((g * d).sum()) for g, d in zip(gradients, directions, strict=True))
-    step, ends = 1e-3, []
-    with torch.no_grad():
-        for sign in (1.0, -2.0):
-            for grid, direction in zip(unknowns.bend, directions, strict=True):
-                grid += sign * step * direction
-            ends.append(float(loss().double()))
-    assert got == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=0.02)  # float32 sums of 400 points
+    got, expected = slopes(loss, unknowns.bend, towards("all", unknowns.bend), 1e-3)
+    assert got == pytest.approx(expected, rel=0.02)  # float32 sums of 400 points

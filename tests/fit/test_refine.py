@@ -38,10 +38,7 @@ def refined(start, views):
 
 def half_colors(asset) -> torch.Tensor:
     """Mean linear base color of the faces of either half, ``(2, 3)``."""
-    from reli3d.render.gbuffer import surface_points
-
-    face = torch.arange(len(asset.mesh.faces), dtype=torch.int32)
-    at = surface_points(asset.mesh, asset.textures, face, torch.full((len(face), 2), 1 / 3))
+    at = small_scene.centers(asset)
     return torch.stack([at.base_color[at.position[:, 0] * s > 0.25].mean(0) for s in (1.0, -1.0)])
 
 
@@ -61,9 +58,8 @@ def test_a_small_scene_is_recovered(refined, start):
 def test_few_views_fit_the_light_and_keep_the_base_color(views):
     true = small_scene.two_colored(small_scene.ball())
     first = replace(true, environment=Environment(torch.full((16, 32, 3), 0.5)))
-    few = replace(
-        views, **{name: getattr(views, name)[:3] for name in ("images", "masks", "c2w", "intrinsics")}, names=()
-    )
+    three = {name: getattr(views, name)[:3] for name in ("images", "masks", "c2w", "intrinsics")}
+    few = replace(views, **three, names=())
     off = []
     for weights in (Weights(), Weights(base_color=0.0)):
         result = fit.refine(first, few, steps=30, resolution=24, weights=weights)

@@ -7,8 +7,7 @@ import torch
 from reli3d.render.environment import Environment
 from reli3d.render.material import eval_bsdf, pdf_lobes, sample_bsdf
 from reli3d.render.sampling import halton
-from reli3d.render.shading import ShadeOptions, shade
-from tests.support.surfaces import at
+from tests.support.surfaces import lit, on_ball
 
 ROUGHNESS = np.linspace(0.05, 1.0, 8)
 QUADRATURE = 2e-5  # change of the albedo by the last halving of its step
@@ -48,9 +47,7 @@ def test_white_metal_sends_out_its_directional_albedo_and_never_more_than_comes_
     def sent(n, roughness, cos_o, seed):
         normal, wo = (v.expand(n, 3).contiguous() for v in (view(1.0, device), view(cos_o, device)))
         width, one = torch.full((n,), float(roughness), device=device), torch.ones(n, device=device)
-        return shade(
-            *at(normal, normal, normal, wo, torch.ones_like(wo), width, one), light, options=ShadeOptions(seed=seed)
-        )[:, 0].double()
+        return lit(on_ball(normal, wo, torch.ones_like(wo), width, one), light, seed=seed)[:, 0].double()
 
     for i, roughness in enumerate(ROUGHNESS):
         for k, cos_o in enumerate(COSINES):
@@ -169,13 +166,10 @@ def test_a_white_surface_in_the_furnace_of_the_shader(device):
     for roughness in (0.05, 0.3, 1.0):
         for cos_o in (0.05, 0.3, 1.0):
             wo = view(cos_o, device).expand(n, 3).contiguous()
-            points, wo = at(normal, normal, normal, wo, torch.ones_like(wo), one * roughness, one * 0.0)
-            lit = shade(points, wo, light)[:, 0].double()
+            points = on_ball(normal, wo, torch.ones_like(wo), one * roughness, one * 0.0)
+            shown = lit(points, light)[:, 0].double()
             u = halton(1 << 16, device=device)
             expected = albedo(view(cos_o, device), one[0] * roughness**2, one[:3], one[0] * 0, u)[0]
-            got, noise = lit.mean(), lit.std() / n**0.5
+            got, noise = shown.mean(), shown.std() / n**0.5
             assert abs(got - expected) < 4 * noise + 2e-4 and got < 1.0 + 1e-3  # 2e-4: of the points in the quadrature
-            assert (
-                cos_o > 0.1
-                or shade(points, wo, light, options=ShadeOptions(diffuse_model="published"))[:, 0].mean() > got + 0.02
-            )
+            assert cos_o > 0.1 or lit(points, light, diffuse_model="published")[:, 0].mean() > got + 0.02

@@ -6,17 +6,15 @@ import trimesh
 
 from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
-from reli3d.render.shading import ShadeOptions, shade
 from tests.support.bootstrap import interval
+from tests.support.meshes import mesh_from
 from tests.support.scenes import SKIES, light, sky
-from tests.support.surfaces import at, inputs
+from tests.support.surfaces import at, inputs, lit, on_ball
 
 
 def ball(device):
-    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
-    mesh.apply_translation([0.0, 1.0, 0.0])
-    vertices = torch.tensor(mesh.vertices, dtype=torch.float32, device=device)
-    return RayScene(vertices, torch.tensor(mesh.faces, dtype=torch.int32, device=device))
+    shape = trimesh.creation.icosphere(subdivisions=2, radius=0.5).apply_translation([0.0, 1.0, 0.0])
+    return RayScene(mesh_from(shape, device))
 
 
 def test_mean_gradient_with_shadows_is_the_difference_of_means(device):
@@ -33,13 +31,8 @@ def test_mean_gradient_with_shadows_is_the_difference_of_means(device):
     weight = torch.randn(n, 3, generator=g).to(device)
 
     def image(normal, base, rough, metal, texels, seed, samples=(320, 640, 64), scene=scene):
-        env = Environment(texels)
-        return shade(
-            *at(place, normal, values[0], wo, base, rough, metal),
-            env,
-            scene=scene,
-            options=ShadeOptions(seed=seed, samples=samples),
-        )
+        points = at(place, normal, values[0], wo, base, rough, metal)
+        return lit(points, Environment(texels), scene=scene, seed=seed, samples=samples)
 
     leaves = [v.clone().requires_grad_() for v in (normal, *values[2:], map_)]
     shadow = (image(*leaves, 0) < 0.9 * image(*leaves, 0, scene=None)).any(1)
@@ -82,11 +75,8 @@ def test_black_texels_get_a_gradient_only_where_a_strategy_reaches_them(device):
     grads = {}
     for counts in ((64, 0, 0), (0, 0, 64), (20, 40, 4)):
         leaf = map_.clone().requires_grad_()
-        out = shade(
-            *at(up, up, up, up, flat[:, None].expand(n, 3), flat, torch.zeros_like(flat)),
-            Environment(leaf),
-            options=ShadeOptions(samples=counts),
-        )
+        points = on_ball(up, up, flat[:, None].expand(n, 3), flat, torch.zeros_like(flat))
+        out = lit(points, Environment(leaf), samples=counts)
         grads[counts] = torch.autograd.grad(out.mean(0).sum(), leaf)[0][0].sum()  # the black row about the zenith
     exact = grads[(0, 0, 64)]
     # 4 of 64 samples by the cosine and 40 by visible normals reach it: their noise over 40000 points is below 1 %
@@ -105,11 +95,8 @@ def spread(roughness, metallic, environment, runs=256, base=None, **options):
     rough = torch.full((n,), roughness, device=normal.device).requires_grad_()
     facing, view = normal.repeat(runs, 1).requires_grad_(), wo.repeat(runs, 1)
     base_color, fixed = base.repeat(runs, 1).requires_grad_(), facing.detach()
-    out = shade(
-        *at(fixed, facing, fixed, view, base_color, rough, torch.full_like(rough, metallic).detach()),
-        environment,
-        options=ShadeOptions(**{"sequence": "random", **options}),
-    ).mean(1)
+    points = at(fixed, facing, fixed, view, base_color, rough, torch.full_like(rough, metallic).detach())
+    out = lit(points, environment, **{"sequence": "random", **options}).mean(1)
     gradient, turn, tint = torch.autograd.grad(out.sum(), (rough, facing, base_color))
     turn = turn - (turn * fixed).sum(-1, keepdim=True) * fixed
     return [v.detach().double().reshape(runs, 24, -1) for v in (out, gradient, turn, tint)]
@@ -122,12 +109,8 @@ def texel_spread(roughness, metallic, environment, runs=256, **options):
     env, flat, rows = Environment(texels), torch.ones(24, device=normal.device), []
     for k in range(runs):
         pixels = torch.arange(24 * k, 24 * (k + 1), dtype=torch.int32, device=normal.device)
-        out = shade(
-            *at(normal, normal, normal, wo, base, flat * roughness, flat * metallic),
-            env,
-            pixels=pixels,
-            options=ShadeOptions(**{"sequence": "random", **options}),
-        )
+        points = on_ball(normal, wo, base, flat * roughness, flat * metallic)
+        out = lit(points, env, pixels=pixels, **{"sequence": "random", **options})
         rows.append(torch.autograd.grad(out.mean(), texels)[0].double().reshape(1, -1))
     return torch.stack(rows)
 

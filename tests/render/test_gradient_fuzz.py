@@ -14,9 +14,8 @@ from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from reli3d.render.material import DIFFUSE_MODELS, eval_bsdf, sample_bsdf
 from reli3d.render.sampling import random_pairs
-from reli3d.render.shading import ShadeOptions, shade
 from tests.support import reference
-from tests.support.surfaces import at
+from tests.support.surfaces import at, lit
 
 N = 100_000
 EDGES = {"alpha": (0.0, 1e-3, 0.01, 0.1, 1.0), "metallic": (0.0, 1.0, 1e-7, 0.5), "base": (0.0, 1.0, 0.5)}
@@ -102,10 +101,8 @@ def adjusted(normal, ng, wo):
 def in_float64(leaves, ng, wo, draws, density, light, diffuse_model):
     """Radiance ``(N, 3)``: mean over constant directions ``draws`` of value, cosine and ``light`` over ``density``."""
     normal, base, alpha, metallic = leaves
-    wo, n = (
-        normalize(wo, dim=-1),
-        normalize(adjusted(normal, ng, wo), dim=-1),
-    )  # a float32 length errs by 1e-7, alpha^2 is 1e-6
+    # a float32 length errs by 1e-7, alpha^2 is 1e-6
+    wo, n = normalize(wo, dim=-1), normalize(adjusted(normal, ng, wo), dim=-1)
     turn, out = frame(n.detach())[:, :2], 0.0
     for d, p, radiance in zip(draws, density, light, strict=True):
         d = normalize(d, dim=-1)
@@ -161,18 +158,9 @@ def test_gradients_of_the_estimator(device, strategy, diffuse_model):
     counts = (count, 0, 0) if strategy == "map" else (0, count, 0)
 
     def grads(weight):
-        out = shade(
-            *at(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), leaves[1], leaves[2], leaves[3]),
-            Environment(leaves[4]),
-            options=ShadeOptions(
-                samples=counts,
-                seed=seed,
-                antithetic="none",
-                sequence="random",
-                alpha="linear",
-                diffuse_model=diffuse_model,
-            ),
-        )
+        points = at(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), *leaves[1:4])
+        options = dict(antithetic="none", sequence="random", alpha="linear", diffuse_model=diffuse_model)
+        out = lit(points, Environment(leaves[4]), samples=counts, seed=seed, **options)
         return out.detach(), torch.autograd.grad((out * weight.to(device)).sum(), leaves)
 
     weight = torch.rand(N, 3, generator=generator)
@@ -182,14 +170,8 @@ def test_gradients_of_the_estimator(device, strategy, diffuse_model):
     part = [v.detach().cpu().double()[smooth].requires_grad_() for v in leaves[:4]]
     radiance = texels.double().requires_grad_()
     light = [reference.lookup_envmap(radiance, d[smooth]) for d in draws]
-    expected = in_float64(
-        part,
-        *(v[smooth] for v in exact),
-        [d[smooth] for d in draws],
-        [p[smooth] for p in density],
-        light,
-        diffuse_model,
-    )
+    found = [d[smooth] for d in draws], [p[smooth] for p in density]
+    expected = in_float64(part, *(v[smooth] for v in exact), *found, light, diffuse_model)
     *expected_grads, g_texels = torch.autograd.grad((expected * weight.double()[smooth]).sum(), [*part, radiance])
     assert reference.fraction_within(value[smooth], expected) >= 0.999
     wide = alpha[smooth] > 0.3
@@ -221,11 +203,8 @@ def test_all_strategies_together_keep_their_gradients_finite(device, light, opti
     if light == "sun":
         texels = torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(5)) ** 30 * 1e5
     leaves = [v.to(device).requires_grad_() for v in (normal, base, alpha, metallic, texels)]
-    out = shade(
-        *at(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), *leaves[1:4]),
-        Environment(leaves[4]),
-        options=ShadeOptions(samples=(2, 4, 1), alpha="linear", **options),
-    )
+    points = at(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), *leaves[1:4])
+    out = lit(points, Environment(leaves[4]), samples=(2, 4, 1), alpha="linear", **options)
     grads = torch.autograd.grad(out.sum(), leaves)
     assert all(bool(torch.isfinite(v).all()) for v in (out, *grads))
     # no light, no gradient except the light's
@@ -307,7 +286,7 @@ def test_shaded_points_of_slivers_have_finite_gradients(device):
         leaves = [v.to(device).requires_grad_() for v in (corners, normals, uv, *maps, texels)]
         own = None if own is None else own.to(device).requires_grad_()
         points = surface_points(Mesh(leaves[0], faces, leaves[1], leaves[2], own), TextureSet(*leaves[3:7]), face, bary)
-        out = shade(points, wo, Environment(leaves[7]), options=ShadeOptions(samples=(2, 4, 1)))
+        out = lit((points, wo), Environment(leaves[7]), samples=(2, 4, 1))
         leaves += [] if own is None else [own]
         grads = torch.autograd.grad(weighed([*vars(points).values(), out]), leaves)
         for k, v in enumerate((*vars(points).values(), out, *grads)):

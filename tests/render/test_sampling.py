@@ -17,9 +17,8 @@ from reli3d.render.sampling import (
     sample_cosine,
     sample_ggx_vndf,
 )
-from reli3d.render.shading import ShadeOptions, shade
 from tests.support import chi2, reference
-from tests.support.surfaces import at
+from tests.support.surfaces import lit, on_ball
 
 N = 1_000_000
 QUICK = [(alpha, deg) for alpha in (0.1, 0.5, 1.0) for deg in (0, 45, 80)]
@@ -117,11 +116,8 @@ def test_pairs_of_the_shader_are_those_of_the_samplers(device, points, pairs):
         density = sum(lobes[:, int(name == "mirrored"), None] for name, _ in pair)
         expected += torch.where(wi[:, 2:] > 1e-6, eval_bsdf(wo, base, rough**2, metal, wi) * wi[:, 2:] / density, 0.0)
     env = Environment(torch.full((4, 8, 3), 0.7, device=device))
-    got = shade(
-        *at(up, up, up, wo, base, rough, metal),
-        env,
-        options=ShadeOptions(samples=(0, 2, 0), seed=seed, sequence=points, antithetic=pairs),
-    )
+    drawn = on_ball(up, wo, base, rough, metal)
+    got = lit(drawn, env, samples=(0, 2, 0), seed=seed, sequence=points, antithetic=pairs)
     # sharp lobes have few digits of the half vector
     assert reference.fraction_within(got.cpu(), 0.7 * expected.cpu()) > 0.999
 

@@ -13,8 +13,9 @@ from reli3d.render.material import DIFFUSE_MODELS
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 from tests.support import reference
+from tests.support.meshes import mesh_from
 from tests.support.scenes import shadow_caster, sky
-from tests.support.surfaces import at, points
+from tests.support.surfaces import at, lit, on_ball, points
 
 
 def repeat(count, *rows):
@@ -32,30 +33,17 @@ def test_every_strategy_and_mix_converges_to_the_quadrature(device, counts, roug
     env, (normal, wo) = sky(), points(3)
     for k in range(2):
         base = torch.tensor([0.8, 0.5, 0.2])
+        finish = torch.tensor([roughness**2, metallic]).double()
         exact = reference.direct_light(
-            normal[k].double(),
-            wo[k].double(),
-            base.double(),
-            torch.tensor(roughness**2).double(),
-            torch.tensor(metallic).double(),
-            env.radiance.double(),
+            normal[k].double(), wo[k].double(), base.double(), *finish, env.radiance.double()
         )
         n = 3000
-        args = repeat(
-            n, normal[k : k + 1], wo[k : k + 1], base[None], torch.tensor([roughness]), torch.tensor([metallic])
-        )
-        args = [a.to(device) for a in args]
+        rows = normal[k : k + 1], wo[k : k + 1], base[None], torch.tensor([roughness]), torch.tensor([metallic])
+        args = [a.to(device) for a in repeat(n, *rows)]
         light = Environment(env.radiance.to(device))
-        for extra in (
-            {},
-            {"sequence": "random", "heuristic": "power", "antithetic": "mirrored"},
-            {"antithetic": "none"},
-        ):
-            got = shade(
-                *at(args[0], args[0], args[0], args[1], args[2], args[3], args[4]),
-                light,
-                options=ShadeOptions(samples=counts, **extra),
-            )
+        other = {"sequence": "random", "heuristic": "power", "antithetic": "mirrored"}
+        for extra in ({}, other, {"antithetic": "none"}):
+            got = lit(on_ball(*args), light, samples=counts, **extra)
             error = got.std(0) / n**0.5 + 2e-4 * exact.float().to(device)  # second term: quadrature error, 256 rows
             z = ((got.mean(0) - exact.to(device)) / error).abs().max()
             assert z < 4.5, (extra, got.mean(0), exact)  # 6e-6 a number, about 300 numbers in the family
@@ -72,11 +60,10 @@ def test_lambert_under_constant_light_is_its_closed_form(device, diffuse_model, 
     kd, c = torch.tensor([0.8, 0.5, 0.2]), torch.tensor([2.0, 0.7, 1.3])
     normal, wo, base, one, zero = (v.to(device) for v in repeat(n, up, view, kd[None], torch.ones(1), torch.zeros(1)))
     env = Environment.constant(c.to(device))
-    lit = [
-        shade(*at(normal, normal, normal, wo, b, one, zero), env, options=ShadeOptions(diffuse_model=diffuse_model))
-        for b in (torch.zeros_like(base), base)
-    ]
-    got = (lit[1] - lit[0]).double().cpu()
+    black, white = (
+        lit(on_ball(normal, wo, b, one, zero), env, diffuse_model=diffuse_model) for b in (torch.zeros_like(base), base)
+    )
+    got = (white - black).double().cpu()
     d, angle = reference.sphere_grid(512)
     d = d[d[:, 1] > 0]
     schlick = lambda cos: 0.04 + 0.96 * (1 - cos) ** 5  # noqa: E731
@@ -98,48 +85,24 @@ def test_edge_inputs_are_finite_and_not_negative(device):
     pick = lambda *v: torch.tensor(v)[torch.randint(len(v), (n,), generator=g)].to(device)  # noqa: E731
     env = sky(power=30.0)
     env = Environment((env.radiance * 1e4).to(device))
-    got = shade(
-        *at(
-            normal,
-            normal,
-            ng,
-            wo,
-            torch.rand(n, 3, generator=g).to(device),
-            pick(0.0, 1e-3, 1.0, 0.5),
-            pick(0.0, 1.0, 0.3),
-        ),
-        env,
-    )
+    base = torch.rand(n, 3, generator=g).to(device)
+    got = lit(at(normal, normal, ng, wo, base, pick(0.0, 1e-3, 1.0, 0.5), pick(0.0, 1.0, 0.3)), env)
     assert bool(torch.isfinite(got).all()) and float(got.min()) >= 0.0
-    black = shade(
-        *at(normal, normal, ng, wo, torch.rand(n, 3).to(device), pick(0.2), pick(0.5)),
-        Environment.constant(torch.zeros(3, device=device)),
-    )
-    assert float(black.abs().max()) == 0.0
-    none = shade(
-        *at(normal, normal, ng, wo, torch.rand(n, 3).to(device), pick(0.2), pick(0.5)),
-        env,
-        options=ShadeOptions(samples=(0, 0, 0)),
-    )
-    assert float(none.abs().max()) == 0.0
-    empty = shade(
-        *at(*(torch.zeros(0, 3, device=device),) * 5, torch.zeros(0, device=device), torch.zeros(0, device=device)), env
-    )
-    assert empty.shape == (0, 3)
+    one = at(normal, normal, ng, wo, base, pick(0.2), pick(0.5))
+    assert float(lit(one, Environment.constant(torch.zeros(3, device=device))).abs().max()) == 0.0
+    assert float(lit(one, env, samples=(0, 0, 0)).abs().max()) == 0.0
+    empty = (torch.zeros(0, *shape, device=device) for shape in [(3,)] * 5 + [()] * 2)
+    assert lit(at(*empty), env).shape == (0, 3)
 
 
 def test_bits_do_not_depend_on_chunks(device):
     normal, wo = points(6000)
-    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
-    vertices, faces = torch.tensor(mesh.vertices).float().to(device), torch.tensor(mesh.faces).int().to(device)
-    scene = RayScene(vertices, faces)
-    args = [normal, normal, normal, wo, torch.rand(6000, 3), torch.rand(6000), torch.rand(6000)]
-    args = [a.to(device) for a in args]
+    scene = RayScene(mesh_from(trimesh.creation.icosphere(subdivisions=2, radius=0.5), device))
+    args = [a.to(device) for a in (normal, wo, torch.rand(6000, 3), torch.rand(6000), torch.rand(6000))]
     light = Environment(sky().radiance.to(device))
-    whole = shade(*at(*args), light, scene=scene)
-    part = [a[700:900] for a in args]
+    whole = lit(on_ball(*args), light, scene=scene)
     ids = torch.arange(700, 900, dtype=torch.int32, device=device)
-    assert torch.equal(shade(*at(*part), light, scene=scene, pixels=ids), whole[700:900])
+    assert torch.equal(lit(on_ball(*(a[700:900] for a in args)), light, scene=scene, pixels=ids), whole[700:900])
 
 
 def test_embree_and_warp_cast_the_same_shadows_in_values_and_gradients():
@@ -148,7 +111,7 @@ def test_embree_and_warp_cast_the_same_shadows_in_values_and_gradients():
     results = []
     for scene in (shadow_caster("cpu", "embree"), shadow_caster("cpu", "warp"), None):
         still = inputs[0].detach()
-        got = shade(*at(still * 0.5, inputs[0], still, wo, *inputs[1:4]), Environment(inputs[4]), scene=scene)
+        got = lit(at(still * 0.5, inputs[0], still, wo, *inputs[1:4]), Environment(inputs[4]), scene=scene)
         results.append([got.detach(), *torch.autograd.grad((got * weight).sum(), inputs)])
     a, b, free = results
     changed = ((a[0] - b[0]).abs() > 1e-5).any(-1).float().mean()
@@ -166,20 +129,16 @@ def test_a_single_sample_is_cut_at_the_clamp(device, counts, shadows):
     wo, inputs = gradient_inputs(device, n=2000)
     normal, *values = (v.detach() for v in inputs)
     scene = shadow_caster(device) if shadows else None
-    args, light = (normal * 0.5, normal, normal, wo, *values[:3]), Environment(values[3])
+    args, light = at(normal * 0.5, normal, normal, wo, *values[:3]), Environment(values[3])
     for seed in range(8):
         options = {"samples": counts, "seed": seed, "sequence": "random"}
-        free = shade(*at(*args), light, scene=scene, options=ShadeOptions(**options))
+        free = lit(args, light, scene=scene, **options)
         clamp = float(free[free > 0].median())
-        assert torch.equal(
-            shade(*at(*args), light, scene=scene, options=ShadeOptions(clamp=clamp, **options)), free.clamp(max=clamp)
-        )
-        assert torch.equal(shade(*at(*args), light, scene=scene, options=ShadeOptions(clamp=1e30, **options)), free)
+        assert torch.equal(lit(args, light, scene=scene, clamp=clamp, **options), free.clamp(max=clamp))
+        assert torch.equal(lit(args, light, scene=scene, clamp=1e30, **options), free)
         # of four samples each is cut at a quarter: none adds up to more, and what stays below a quarter is whole
         options["samples"] = tuple(4 * k for k in counts)
-        whole, cut = (
-            shade(*at(*args), light, scene=scene, options=ShadeOptions(clamp=c, **options)) for c in (None, clamp)
-        )
+        whole, cut = (lit(args, light, scene=scene, clamp=c, **options) for c in (None, clamp))
         assert float(cut.max()) <= clamp * (1 + 1e-6) and bool((cut <= whole).all())
         low = whole <= clamp / 4
         assert torch.equal(cut[low], whole[low]) and 0.01 < float((cut < whole).float().mean()) < 0.99
@@ -239,21 +198,14 @@ def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device,
     def loss(normal, base, roughness, metallic, radiance):
         env = Environment(radiance)
         object.__setattr__(env, "cdf", cdf)  # the light's own change must not move the samples either
-        got = shade(
-            *at(normal, normal, normal, wo, base, roughness, metallic),
-            env,
-            options=ShadeOptions(samples=(48, 0, 0), diffuse_model=diffuse_model, clamp=clamp),
-        )
-        return (got * weight).double().sum()
+        points = on_ball(normal, wo, base, roughness, metallic)
+        return (lit(points, env, samples=(48, 0, 0), diffuse_model=diffuse_model, clamp=clamp) * weight).double().sum()
 
     cdf, clamp = Environment(inputs[4].detach()).cdf, None
     if clamped:  # the middle one of single samples
         normal, *rest = (v.detach() for v in inputs)
-        single = shade(
-            *at(normal, normal, normal, wo, *rest[:3]),
-            Environment(rest[3]),
-            options=ShadeOptions(samples=(1, 0, 0), diffuse_model=diffuse_model),
-        )
+        light = Environment(rest[3])
+        single = lit(on_ball(normal, wo, *rest[:3]), light, samples=(1, 0, 0), diffuse_model=diffuse_model)
         clamp = float(single[single > 0].median())
     grads = torch.autograd.grad(loss(*inputs), inputs)
     generator = torch.Generator().manual_seed(3)
@@ -311,10 +263,8 @@ def test_mean_gradient_is_that_of_the_integral(device, counts, options):
         rows = [r.to(device).requires_grad_() for r in rows]
         light = env.radiance.to(device).requires_grad_()
         view = wo[k : k + 1].expand(n, 3).contiguous().to(device)
-        lit = Environment(light)
-        got = shade(
-            *at(rows[0], rows[0], rows[0], view, *rows[1:]), lit, options=ShadeOptions(samples=counts, **options)
-        )
+        map_ = Environment(light)
+        got = lit(on_ball(rows[0], view, *rows[1:]), map_, samples=counts, **options)
         error = got.detach().std(0) / n**0.5 + 5e-4 * value.detach().float().to(device)  # 192 rows of quadrature
         assert ((got.detach().mean(0) - value.detach().to(device)) / error).abs().max() < 4.5
         grads = torch.autograd.grad(got.sum(), rows)
@@ -324,11 +274,7 @@ def test_mean_gradient_is_that_of_the_integral(device, counts, options):
             assert ((g.mean(0) - t.to(device)) / error).abs().max() < 4.5
         fixed, gradients = [r[:100].detach() for r in rows], []
         for seed in range(60):  # means of 100 rows, for the error of a map's gradient
-            part = shade(
-                *at(*[fixed[0]] * 3, view[:100], *fixed[1:]),
-                lit,
-                options=ShadeOptions(samples=counts, seed=seed, **options),
-            )
+            part = lit(on_ball(fixed[0], view[:100], *fixed[1:]), map_, samples=counts, seed=seed, **options)
             gradients.append(torch.autograd.grad(part.sum() / 100, light)[0].cpu().double())
         gradients = torch.einsum("bhwc,phwc->bp", torch.stack(gradients), probes.double())
         expected = torch.einsum("hwc,phwc->p", exact[4], probes.double())
@@ -340,13 +286,11 @@ def test_mean_gradient_is_that_of_the_integral(device, counts, options):
 
 def test_clamped_samples_have_no_gradient(device):
     wo, inputs = gradient_inputs(device, n=6000)
-    free = shade(*at(inputs[0], inputs[0], inputs[0], wo, *inputs[1:4]), Environment(inputs[4]))
+    free = lit(on_ball(inputs[0], wo, *inputs[1:4]), Environment(inputs[4]))
     (whole,) = torch.autograd.grad(free.square().sum(), inputs[1])
     normal, base = inputs[0].detach(), inputs[1]
     plain = [v.detach() for v in inputs[2:4]]
-    got = shade(
-        *at(normal, normal, normal, wo, base, *plain), Environment(inputs[4].detach()), options=ShadeOptions(clamp=1e-6)
-    )
+    got = lit(on_ball(normal, wo, base, *plain), Environment(inputs[4].detach()), clamp=1e-6)
     clamped = torch.autograd.grad(got.sum(), base)[0].abs().max()
     assert float(clamped) < 1e-4 * float(whole.abs().max())  # only grazing samples stay below such a clamp
 
@@ -367,18 +311,13 @@ def test_memory_does_not_grow_with_samples(device, shadows):
     """Forward and backward of 2048 points: 1024 samples each need 30 words of visibility more than 64.  An array of two
     million of anything, a byte each at least, would be 100 times the slack."""
     wo, inputs = gradient_inputs(device, n=2048)
-    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
-    vertices, faces = torch.tensor(mesh.vertices).float().to(device), torch.tensor(mesh.faces).int().to(device)
-    scene, environment = RayScene(vertices, faces) if shadows else None, Environment(inputs[4])
+    scene, environment = None, Environment(inputs[4])
+    if shadows:
+        scene = RayScene(mesh_from(trimesh.creation.icosphere(subdivisions=2, radius=0.5), device))
 
     def most(samples):
         def step():
-            out = shade(
-                *at(inputs[0], inputs[0], inputs[0], wo, *inputs[1:4]),
-                environment,
-                scene=scene,
-                options=ShadeOptions(samples=samples),
-            )
+            out = lit(on_ball(inputs[0], wo, *inputs[1:4]), environment, scene=scene, samples=samples)
             torch.autograd.grad(out.sum(), inputs)
 
         step()  # creates cached values

@@ -18,9 +18,9 @@ from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.image import render_asset
-from reli3d.render.shading import Samples, ShadeOptions, shade
+from reli3d.render.shading import Samples, ShadeOptions
 from tests.support import mitsuba_scene
-from tests.support.surfaces import at
+from tests.support.surfaces import at, lit
 
 pytestmark = pytest.mark.slow  # Mitsuba compiles its kernels for half a minute a case
 
@@ -72,19 +72,10 @@ class Stage:
 
     def shade(self, base, roughness, metallic, environment, seed):
         n = len(self.position)
-        values = (
-            self.position,
-            self.normal,
-            self.ng,
-            -self.directions,
-            base.expand(n, 3),
-            roughness.expand(n),
-            torch.full((n,), metallic),
-        )
+        material = base.expand(n, 3), roughness.expand(n), torch.full((n,), metallic)
+        values = self.position, self.normal, self.ng, -self.directions, *material
         light = Environment(environment.radiance.to(self.device))
-        return shade(
-            *at(*(v.to(self.device) for v in values)), light, scene=self.scene, options=ShadeOptions(seed=seed)
-        ).cpu()
+        return lit(at(*(v.to(self.device) for v in values)), light, scene=self.scene, seed=seed).cpu()
 
 
 @pytest.mark.parametrize("material", MATERIALS)

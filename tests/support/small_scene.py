@@ -11,9 +11,12 @@ from reli3d.geometry.uv import unwrap
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
+from reli3d.render.gbuffer import surface_points
 from reli3d.render.image import render_asset
+from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions
 from reli3d.views.views import ViewBatch
+from tests.support.reference_surface import grid
 from tests.support.rigs import eyes_around
 
 TEXELS = 64
@@ -21,9 +24,7 @@ TEXELS = 64
 
 def ball(radius: float = 0.8, cells: int = 24, squeeze: float = 1.0) -> Asset:
     """A closed ball with an atlas, gray maps and an even light; ``squeeze`` scales its height."""
-    axis = torch.linspace(-1.0, 1.0, cells + 1)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    sdf = (points / torch.tensor([1.0, squeeze, 1.0])).norm(dim=-1) - radius
+    sdf = (grid(cells) / torch.tensor([1.0, squeeze, 1.0])).norm(dim=-1) - radius
     mesh = unwrap(extract_surface(sdf, radius=1.0).with_normals(), texture_size=TEXELS)
     mesh = mesh.with_tangents()
     gray = srgb_to_linear(torch.full((TEXELS, TEXELS, 3), 0.6))
@@ -47,6 +48,12 @@ def two_colored(asset: Asset) -> Asset:
 
     color = srgb_to_linear(bake(asset.mesh, TEXELS, base_color)["value"])
     return Asset(asset.mesh, replace(asset.textures, base_color=color), sky())
+
+
+def centers(asset: Asset) -> SurfacePoints:
+    """Of the faces."""
+    face = torch.arange(len(asset.mesh.faces), dtype=torch.int32)
+    return surface_points(asset.mesh, asset.textures, face, torch.full((len(face), 2), 1 / 3))
 
 
 def input_views(asset: Asset, count: int, size: int) -> ViewBatch:

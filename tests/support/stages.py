@@ -1,5 +1,6 @@
 """A network that shows a ball from the first step on, and small samples to train it with."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from reli3d.render.latlong import lat_long_directions
 from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.samples import ObjectSurface, synthesize
 
-RADIUS = 0.5
+RADIUS, SEEDS = 0.5, (3, 12)
 SMALL = replace(TINY, name="smaller", image_size=32, plane_size=4, resolution=16)
 
 
@@ -42,10 +43,21 @@ def camera(size: int) -> Camera:
     return Camera.from_fov(look_at([0.4, 0.5, 2.0], [0.0, 0.0, 0.0]), 0.75, size, size)
 
 
-def write_samples(folder: Path, seeds=(3, 12), views: int = 4) -> Path:
-    """Samples of 48 pixels under a sky that is bright towards +X."""
+def rows(run: Path) -> list[dict]:
+    return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+
+
+def numbers(run: Path) -> list[dict]:
+    """Rows of the log without the configuration and the time."""
+    return [{k: v for k, v in row.items() if k != "seconds"} for row in rows(run) if "config" not in row]
+
+
+def write_samples(folder: Path, seeds=SEEDS, views: int = 4, size: int = 48) -> Path:
+    """Samples of a seed each, under a sky that is bright towards +X."""
     light = 0.2 + 3.0 * lat_long_directions(32)[..., :1].clamp(min=0).expand(-1, -1, 3).contiguous()
     for seed in seeds:
-        sample = synthesize(ObjectSurface(make_object(seed)), light, np.random.default_rng(seed), size=48, views=views)
+        sample = synthesize(
+            ObjectSurface(make_object(seed)), light, np.random.default_rng(seed), size=size, views=views
+        )
         save_file(sample, folder / f"{seed:010d}.safetensors")
     return folder

@@ -1,9 +1,35 @@
 """Points to shade, at random, and from arrays in the order of the estimator's formulas."""
 
+from collections.abc import Callable
+
 import torch
+import trimesh
 from torch import Tensor
 
+from reli3d.geometry.distance import signed_distance
+from reli3d.geometry.hits import interpolate
+from reli3d.geometry.rays import RayScene
+from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints
+from reli3d.render.shading import ShadeOptions, shade
+from tests.support.meshes import mesh_from
+
+
+class Ball:
+    """To make samples of.  ``finish`` gives base color, roughness and metallic of positions."""
+
+    def __init__(self, finish: Callable, subdivisions: int, radius: float):
+        mesh = mesh_from(trimesh.creation.icosphere(subdivisions, radius))
+        self.vertices, self.faces, self.finish = mesh.vertices, mesh.faces, finish
+        self.scene = RayScene(self.vertices, self.faces)
+
+    def distance(self, points):
+        return signed_distance(self.vertices, self.faces, points)
+
+    def points_at(self, face, bary):
+        position = interpolate(self.vertices, self.faces, face.int(), bary)
+        normal = torch.nn.functional.normalize(position, dim=-1)
+        return SurfacePoints(position, normal, normal, *self.finish(position))
 
 
 def at(position, normal, ng, wo, base_color, roughness, metallic) -> tuple[SurfacePoints, Tensor]:
@@ -14,6 +40,11 @@ def at(position, normal, ng, wo, base_color, roughness, metallic) -> tuple[Surfa
 def on_ball(normal, wo, base_color, roughness, metallic) -> tuple[SurfacePoints, Tensor]:
     """The same for points of the unit ball, whose three vectors are one."""
     return at(normal, normal, normal, wo, base_color, roughness, metallic)
+
+
+def lit(points: tuple[SurfacePoints, Tensor], light: Environment, *, scene=None, pixels=None, **options) -> Tensor:
+    """Their radiance; ``options`` of the estimator by name."""
+    return shade(*points, light, scene=scene, pixels=pixels, options=ShadeOptions(**options))
 
 
 def points(n, seed=1):

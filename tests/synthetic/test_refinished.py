@@ -2,42 +2,31 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 import torch
-import trimesh
 from PIL import Image
 
 from reli3d.errors import InputError
-from reli3d.geometry.rays import RayScene
 from reli3d.render.color import srgb_to_linear
-from reli3d.render.points import SurfacePoints
 from reli3d.synthetic.refinished import RefinishedSurface, material_sets
 from reli3d.synthetic.samples import random_faces
+from tests.support.surfaces import Ball
 
 PLACEHOLDER = 0.8
 
 
-class Ball:
-    """A ball, red above and blue below, with the placeholders of a scan."""
+def finish(position):
+    """Red above and blue below, with the placeholders of a scan."""
+    color = torch.where(position[:, 1:2] > 0, torch.tensor([0.6, 0.05, 0.05]), torch.tensor([0.05, 0.05, 0.6]))
+    return color, torch.full((len(position),), PLACEHOLDER), torch.zeros(len(position))
 
-    def __init__(self):
-        ball = trimesh.creation.icosphere(3)
-        self.vertices = torch.tensor(ball.vertices, dtype=torch.float32)
-        self.faces = torch.tensor(ball.faces, dtype=torch.int32)
-        self.scene = RayScene(self.vertices, self.faces)
 
-    def distance(self, points):
-        return points.norm(dim=-1) - 1.0
-
-    def points_at(self, face, bary):
-        corners = self.vertices[self.faces[face].long()]
-        weights = torch.stack([1 - bary.sum(-1), bary[:, 0], bary[:, 1]], -1)[..., None]
-        position = (corners * weights).sum(1)
-        normal = torch.nn.functional.normalize(position, dim=-1)
-        color = torch.where(position[:, 1:2] > 0, torch.tensor([0.6, 0.05, 0.05]), torch.tensor([0.05, 0.05, 0.6]))
-        rough = torch.full((len(face),), PLACEHOLDER)
-        return SurfacePoints(position, normal, normal, color, rough, torch.zeros(len(face)))
+@functools.cache
+def ball():
+    return Ball(finish, 3, 1.0)
 
 
 @pytest.fixture
@@ -53,7 +42,7 @@ def sets(tmp_path):
 
 def refinished(sets, seed, *, measured):
     rng = np.random.default_rng(seed)
-    surface = RefinishedSurface(Ball(), sets, rng, measured=measured, texels=256)
+    surface = RefinishedSurface(ball(), sets, rng, measured=measured, texels=256)
     return surface.points_at(*random_faces(surface, 400, np.random.default_rng(0)))
 
 
@@ -117,6 +106,6 @@ def test_a_folder_without_sets_or_with_a_missing_map_is_refused(tmp_path, sets):
 
 
 def test_two_objects_of_five_keep_their_base_color(sets):
-    base = Ball().points_at(*random_faces(Ball(), 400, np.random.default_rng(0))).base_color
+    base = ball().points_at(*random_faces(ball(), 400, np.random.default_rng(0))).base_color
     kept = sum(torch.equal(refinished(sets, seed, measured=True).base_color, base) for seed in range(60))
     assert 24 <= kept <= 48  # 0.4, and a quarter of the rest; three standard deviations are 11

@@ -11,7 +11,7 @@ from reli3d.nn.local import LocalField, LocalReconstructor
 from reli3d.nn.presets import SMALL
 from reli3d.synthetic.procedural import make_object
 from reli3d.train.calibrate import MAX_MISMATCH, MIN_RATIO_DIFFERENCE, calibrate, mismatch, one_standard_error_choice
-from tests.support.samples import SEEDS
+from tests.support.stages import SEEDS
 
 
 class _Thin(LocalReconstructor):

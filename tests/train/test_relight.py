@@ -3,52 +3,34 @@
 import numpy as np
 import pytest
 import torch
-import trimesh
 from safetensors.torch import save_file
 
-from reli3d.geometry.distance import signed_distance
-from reli3d.geometry.rays import RayScene
 from reli3d.render.latlong import lat_long_directions, quarter_turn
-from reli3d.render.points import SurfacePoints
 from reli3d.synthetic.maps import training_maps
 from reli3d.synthetic.samples import synthesize
 from reli3d.train import batches
 from reli3d.train.relight import Finish, draw_light, relight_views
+from tests.support.surfaces import Ball
 
 
-class Ball:
-    """A ball of one base color, rough on the one side and glossy metal on the other."""
-
-    def __init__(self):
-        ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5)
-        self.vertices = torch.as_tensor(ball.vertices, dtype=torch.float32)
-        self.faces = torch.as_tensor(np.asarray(ball.faces), dtype=torch.int32)
-        self.scene = RayScene(self.vertices, self.faces)
-
-    def distance(self, points):
-        return signed_distance(self.vertices, self.faces, points)
-
-    def points_at(self, face, bary):
-        weights = torch.stack([1 - bary.sum(-1), bary[:, 0], bary[:, 1]], -1)[..., None]
-        position = (self.vertices[self.faces[face].long()] * weights).sum(1)
-        normal = torch.nn.functional.normalize(position, dim=-1)
-        right = (position[:, 0] > 0).float()
-        color = torch.stack([0.7 - 0.4 * right, 0.3 + 0.2 * right, 0.2 + 0.5 * right], -1)
-        return SurfacePoints(position, normal, normal, color, 0.8 - 0.4 * right, right)
+def finish(position):
+    """Rough on the one side and glossy metal on the other."""
+    right = (position[:, 0] > 0).float()
+    color = torch.stack([0.7 - 0.4 * right, 0.3 + 0.2 * right, 0.2 + 0.5 * right], -1)
+    return color, 0.8 - 0.4 * right, right
 
 
 @pytest.fixture(scope="module")
 def sky():
     """The same all around, so that the yaw of a sample does not matter: bright above, warm below."""
     y = lat_long_directions(32)[..., 1:2]
-    return (0.3 + 2.0 * y.clamp(min=0) ** 2) * torch.tensor([0.8, 1.0, 1.2]) + 0.4 * (-y).clamp(min=0) * torch.tensor(
-        [1.0, 0.6, 0.3]
-    )
+    below = 0.4 * (-y).clamp(min=0) * torch.tensor([1.0, 0.6, 0.3])
+    return (0.3 + 2.0 * y.clamp(min=0) ** 2) * torch.tensor([0.8, 1.0, 1.2]) + below
 
 
 @pytest.fixture(scope="module")
 def sample(sky):
-    return synthesize(Ball(), sky, np.random.default_rng(2), size=96, views=3)
+    return synthesize(Ball(finish, 5, 0.5), sky, np.random.default_rng(2), size=96, views=3)
 
 
 def maps_of(sample):

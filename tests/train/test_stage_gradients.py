@@ -18,6 +18,7 @@ from reli3d.train.stages.losses import gradients
 from reli3d.train.stages.step import object_losses, total
 from reli3d.train.stages.surface import render_surface, surface
 from reli3d.train.stages.views import Samples, draw
+from tests.support.differences import slopes
 from tests.support.stages import ball_model, camera, write_samples
 
 VOLUME = StageConfig("volume", "volume", 24, lobes=16, grid=8, samples_along=32)
@@ -73,15 +74,8 @@ def test_the_whole_loss_has_the_gradient_of_central_differences(case, one, monke
     def loss() -> torch.Tensor:
         return total(object_losses(model, one, stage, gradients), stage)
 
-    derivatives = torch.autograd.grad(loss(), moved, allow_unused=True)
-    got = sum(float((g.double() * d).sum()) for g, d in zip(derivatives, directions, strict=True) if g is not None)
-    ends = []
-    with torch.no_grad():
-        for sign in (1.0, -2.0):
-            for p, d in zip(moved, directions, strict=True):
-                p += sign * size * d
-            ends.append(float(loss().double()))
-    assert got == pytest.approx((ends[0] - ends[1]) / (2.0 * size), rel=tolerance)
+    got, expected = slopes(loss, moved, directions, size)
+    assert got == pytest.approx(expected, rel=tolerance)
 
 
 MATERIAL_HEADS = ("base_color", "roughness", "metallic")

@@ -26,7 +26,7 @@ from reli3d.train.stages.stage import PaperStage, averaged
 from reli3d.train.stages.step import checkpointed, object_losses, total
 from reli3d.train.stages.views import Samples, draw
 from tests.support.processes import ENVIRONMENT
-from tests.support.stages import SMALL, BallModel, ball_model, write_samples
+from tests.support.stages import SMALL, BallModel, ball_model, numbers, rows, write_samples
 
 GAUSSIANS = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, steps=6, rate=1e-3)
 SIZES = dict(inputs=2, targets=1, background=0.5, input_size=32, target_size=16, patch=0)
@@ -43,15 +43,6 @@ def stage_of(folder, model=None, config=GAUSSIANS, **options):
 
 def options_of(stage, out, **changes):
     return stage.options(str(out), **{"warmup": 2, "save_every": 2, "log_every": 1, **changes})
-
-
-def rows(folder):
-    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-
-
-def numbers(folder):
-    """Rows of the log without the configuration and the time."""
-    return [{k: v for k, v in row.items() if k != "seconds"} for row in rows(folder) if "config" not in row]
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from reli3d.train.stages.stage import PaperStage
 from reli3d.train.stages.step import trunk_layers
 from reli3d.train.stages.views import Samples
 from tests.support.processes import on_two
-from tests.support.stages import ball_model, write_samples
+from tests.support.stages import ball_model, numbers, write_samples
 
 CONFIG = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, steps=4, rate=1e-3)
 STEPS = dict(warmup=2, save_every=2, log_every=1)
@@ -96,11 +96,6 @@ def alone(folder, out, stop=None):
         train(stage, stage.options(str(out), **STEPS))
 
 
-def rows(out):
-    found = [r for r in map(json.loads, (out / "log.jsonl").read_text().splitlines()) if "config" not in r]
-    return [{k: v for k, v in row.items() if k != "seconds"} for row in found]
-
-
 @pytest.fixture(scope="module")
 def runs(folder, tmp_path_factory):
     """``one`` by one process; ``first`` begun in parts and ended by one process; ``last`` the other way."""
@@ -118,10 +113,10 @@ def runs(folder, tmp_path_factory):
 
 def test_losses_and_parameters_are_those_of_one_process_and_either_resumes(runs):
     root, _ = runs
-    one = rows(root / "one")
+    one = numbers(root / "one")
     end = torch.load(root / "one" / "state.pt", weights_only=True)
     for name in ("first", "last"):
-        found = rows(root / name)
+        found = numbers(root / name)
         assert [r["step"] for r in found] == [1, 2, 3, 4]
         for a, b in zip(one, found, strict=True):
             for key in a:  # float32 sums in another order, enlarged by Adam: its first steps have the rate's size
