@@ -58,7 +58,7 @@ def threads():
     use(before)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of real meshes, maps and captures; a test that needs it skips visibly where it is absent."""
     if not (SHARED / "data").is_dir():
@@ -66,7 +66,7 @@ def shared_data() -> Path:
     return SHARED / "data"
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def goldens() -> Path:
     """Folder of reference inputs and outputs of the published model's modules."""
     if not (SHARED / "reference" / "goldens").is_dir():

@@ -212,17 +212,9 @@ def points_of_a_mesh(g, tangents) -> Op:
         uv = at("uv")
         bent = in_texture(v["normal"], uv) * 2.0 - 1.0
         bent = bent[:, :1] * along + bent[:, 1:2] * side * torch.linalg.cross(n, along) + bent[:, 2:] * n
-        color = in_texture(v["base_color"], uv)
-        return torch.cat(
-            [
-                at("vertices"),
-                F.normalize(torch.linalg.cross(b - a, c - a), dim=-1),
-                F.normalize(bent, dim=-1),
-                color,
-                in_texture(torch.stack([v["roughness"], v["metallic"]], -1), uv),
-            ],
-            1,
-        )
+        directions = F.normalize(torch.linalg.cross(b - a, c - a), dim=-1), F.normalize(bent, dim=-1)
+        finish = v["base_color"], torch.stack([v["roughness"], v["metallic"]], -1)
+        return torch.cat([at("vertices"), *directions, *(in_texture(values, uv) for values in finish)], 1)
 
     return Op(leaves, ours, in_float64)
 

@@ -208,6 +208,7 @@ OPERATIONS = {
     "load_views": lambda folder: reli3d.load_views(EXAMPLE),
     "symmetry": lambda folder: mirrored(),
     "meshes": lambda folder: meshes(),
+    "rotated": lambda folder: lights.LIGHTS["sky"](16).rotated(0.7),
     "signed_distance": lambda folder: distance.signed_distance(ball().vertices, ball().faces, units(ROWS)),
     "visible_from": lambda folder: visibility.visible_from(
         reli3d.RayScene(ball().vertices, ball().faces), ball().vertices, ball().with_normals().normals, camera(3)

@@ -16,7 +16,7 @@ from PIL import Image
 from reli3d.capture import capture as function
 from reli3d.cli import infer
 from reli3d.cli.capture import main
-from tests.support.signals import heed_signals
+from tests.support.processes import heed_signals
 
 
 def write_noise(folder, count: int):

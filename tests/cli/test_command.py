@@ -14,7 +14,7 @@ import urllib.request
 import pytest
 
 from reli3d.cli import doctor, main, view
-from tests.support.signals import heed_signals
+from tests.support.processes import heed_signals
 
 
 def test_help_names_every_command_and_the_old_names(capsys):

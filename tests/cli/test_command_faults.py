@@ -10,7 +10,7 @@ import time
 import pytest
 
 from reli3d.cli import infer
-from tests.support.signals import heed_signals
+from tests.support.processes import heed_signals
 
 # reli3d-infer without torch, which takes seconds to load, and without a network: its one object is {body}
 QUICK = """

@@ -10,20 +10,17 @@ import torch
 import trimesh
 
 from reli3d.cli.export import main
-from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.bake import bake
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import read_glb, write_glb
 from reli3d.render.asset import Asset, TextureSet
+from tests.support.meshes import mesh_from
 
 
 @pytest.fixture(scope="module")
 def glb(tmp_path_factory):
     """A ball of 1280 triangles whose base color is a function of the position, at 128 texels."""
-    from reli3d.geometry.bake import bake
-
-    ball = trimesh.creation.icosphere(3)
-    mesh = Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int32))
-    mesh = unwrap(mesh, texture_size=128).with_tangents()
+    mesh = unwrap(mesh_from(trimesh.creation.icosphere(3)), texture_size=128).with_tangents()
 
     def at(position, normal, tangent):
         flat = torch.tensor([0.5, 0.5, 1.0]).expand_as(position)

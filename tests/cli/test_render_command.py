@@ -14,7 +14,6 @@ from PIL import Image
 
 from reli3d.cli.render import main
 from reli3d.geometry.camera import Camera, camera_rays, look_at
-from reli3d.geometry.mesh import Mesh
 from reli3d.io.glb import read_glb, write_glb
 from reli3d.io.hdr import read_environment, read_hdr_image, write_environment
 from reli3d.render.asset import Asset
@@ -22,7 +21,7 @@ from reli3d.render.color import agx, linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.image import render_asset
 from reli3d.render.shading import ShadeOptions
-from tests.support.scenes import ball
+from tests.support.scenes import ball_mesh, textures
 
 SIZE, DISTANCE = 24, 2.6
 
@@ -31,14 +30,7 @@ SIZE, DISTANCE = 24, 2.6
 def scene(tmp_path_factory):
     """Folder with a red ball and, as .hdr and .exr, a light whose one half is dark; exact in either format."""
     folder = tmp_path_factory.mktemp("render")
-    asset = ball(torch.device("cpu"), (0.79, 0.01, 0.01))
-    n = asset.mesh.normals
-    tangent = torch.linalg.cross(n.new_tensor([0.3, 0.5, 0.81]).expand_as(n), n)
-    tangent = torch.cat([torch.nn.functional.normalize(tangent, dim=-1), torch.ones(len(n), 1)], -1)
-    write_glb(
-        folder / "ball.glb",
-        Asset(Mesh(asset.mesh.vertices, asset.mesh.faces, n, asset.mesh.uv, tangent), asset.textures),
-    )
+    write_glb(folder / "ball.glb", Asset(ball_mesh(3, 0.6), textures(4, "cpu", (0.79, 0.01, 0.01))))
     light = torch.full((8, 16, 3), 0.0625)
     light[:, :8] = torch.tensor([2.0, 1.0, 1.0])
     light = light.roll(-4, 1)  # the borders of the halves look to -Z and +Z
@@ -165,9 +157,8 @@ def test_turntables_are_their_frames(scene, turn, monkeypatch):
 
 def test_diffuse_model_and_wrong_options(scene, capsys):
     image = pixels(run(scene, light=None)["ball.png"])
-    changed = (
-        pixels(run(scene, "--diffuse-model", "published", light=None)["ball.png"])[..., :3].int() - image[..., :3].int()
-    )
+    published = pixels(run(scene, "--diffuse-model", "published", light=None)["ball.png"])
+    changed = published[..., :3].int() - image[..., :3].int()
     assert int(changed.max()) > 3 and int(changed.min()) >= -1  # more light at the rim, the same noise
     common = [str(scene / "ball.glb"), "--output", str(scene / "none")]
     assert main([*common, "--diffuse-model", "white"]) == 2
@@ -192,35 +183,13 @@ def test_the_name_of_the_output_makes_an_animation(scene, tmp_path, ending):
     if ending == "mp4":
         av = pytest.importorskip("av")
     path = tmp_path / f"turn.{ending}"
+    places = [str(scene / "ball.glb"), "--light", str(scene / "half.hdr"), "--output", str(path)]
+    options = ["--size", "48", "--frames", "4", "--rotate-light", "--quality", "draft", "--json"]
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
-        assert (
-            main(
-                [
-                    str(scene / "ball.glb"),
-                    "--light",
-                    str(scene / "half.hdr"),
-                    "--output",
-                    str(path),
-                    "--size",
-                    "48",
-                    "--frames",
-                    "4",
-                    "--rotate-light",
-                    "--quality",
-                    "draft",
-                    "--json",
-                ]
-            )
-            == 0
-        )
-    assert json.loads(output.getvalue()) == {
-        "files": [str(path)],
-        "frames": 4,
-        "size": 48,
-        "samples": [6, 12, 2],
-        "supersampling": 1,
-    }
+        assert main(places + options) == 0
+    expected = {"files": [str(path)], "frames": 4, "size": 48, "samples": [6, 12, 2], "supersampling": 1}
+    assert json.loads(output.getvalue()) == expected
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
     if ending == "mp4":
         with av.open(str(path)) as file:

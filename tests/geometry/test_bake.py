@@ -1,8 +1,6 @@
 """Texels against brute force in float64, baking against closed forms, tangents against those of an exporter."""
 
-import json
 import math
-import struct
 
 import numpy as np
 import pytest
@@ -17,17 +15,15 @@ from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import write_glb
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import srgb_to_linear
+from tests.support import gltf
+from tests.support.meshes import mesh_from
 from tests.support.texels import bilinear, color
 
 SIZE = 256
 
 
 def icosphere(subdivisions: int, device="cpu") -> Mesh:
-    ball = trimesh.creation.icosphere(subdivisions)
-    return Mesh(
-        torch.tensor(ball.vertices, dtype=torch.float32, device=device),
-        torch.tensor(ball.faces, dtype=torch.int32, device=device),
-    ).with_normals()
+    return mesh_from(trimesh.creation.icosphere(subdivisions), device).with_normals()
 
 
 @pytest.fixture(scope="module")
@@ -250,21 +246,14 @@ def test_tangents_weigh_faces_by_their_angle(device):
 
 def test_tangents_agree_with_an_exporter(shared_data):
     """NormalTangentMirrorTest stores MikkTSpace tangents, with mirrored UV."""
-    data = (shared_data / "calibration" / "calib_normal_tangent_mirror.glb").read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    document, start = json.loads(data[20 : 20 + size]), 20 + size + 8
-
-    def array(index):
-        accessor = document["accessors"][index]
-        view = document["bufferViews"][accessor["bufferView"]]
-        kind = {5126: "<f4", 5123: "<u2", 5125: "<u4"}[accessor["componentType"]]
-        width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
-        at = start + view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        return np.frombuffer(data, kind, accessor["count"] * width, at).reshape(-1, width)
-
+    document, binary = gltf.parsed((shared_data / "calibration" / "calib_normal_tangent_mirror.glb").read_bytes())
     primitive = document["meshes"][0]["primitives"][0]
-    p, n, t, uv = (array(primitive["attributes"][k]) for k in ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"))
-    faces = array(primitive["indices"]).reshape(-1, 3).astype(np.int32)
+    places = [
+        *(primitive["attributes"][k] for k in ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_0")),
+        primitive["indices"],
+    ]
+    p, n, t, uv, faces = (gltf.array_of(document, binary, place) for place in places)
+    faces = faces.reshape(-1, 3).astype(np.int32)
     got = Mesh(*(torch.from_numpy(v.copy()) for v in (p, faces, n, uv))).with_tangents().tangents.numpy()
     assert (np.sign(got[:, 3]) == np.sign(t[:, 3])).mean() > 0.999 and (t[:, 3] < 0).any() and (t[:, 3] > 0).any()
     cosine = (got[:, :3] * t[:, :3]).sum(1)

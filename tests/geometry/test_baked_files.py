@@ -1,8 +1,6 @@
 """A known color baked on real meshes and extracted surfaces, written as GLB and read back as a viewer samples it."""
 
 import io
-import json
-import struct
 
 import numpy as np
 import pytest
@@ -18,13 +16,12 @@ from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import encode_image, write_glb
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import srgb_to_linear
+from tests.support import gltf
 from tests.support.meshes import QUICK, SLOW, loaded
 from tests.support.texels import bilinear, color
 
 STEP = 1 / 255
 DARKEST = 0.1  # of the color's values: a darker texel was never written
-FIELDS = {5126: ("<f4", 4), 5125: ("<u4", 4)}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 def unit_size(mesh: Mesh) -> Mesh:
@@ -49,23 +46,12 @@ def baked(mesh: Mesh, size: int) -> Asset:
 
 def read(path) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
     """Attributes and images of a file of one primitive, by the standard alone."""
-    data = path.read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    document, start = json.loads(data[20 : 20 + length]), 28 + length
-
-    def view(index: int) -> bytes:
-        at = document["bufferViews"][index]
-        return data[start + at["byteOffset"] : start + at["byteOffset"] + at["byteLength"]]
-
-    def array(index: int) -> np.ndarray:
-        accessor = document["accessors"][index]
-        values = np.frombuffer(view(accessor["bufferView"]), FIELDS[accessor["componentType"]][0])
-        return values.reshape(accessor["count"], WIDTHS[accessor["type"]])
-
+    document, binary = gltf.parsed(path.read_bytes())
     (primitive,) = document["meshes"][0]["primitives"]
-    arrays = {name: array(index) for name, index in primitive["attributes"].items()}
-    arrays["faces"] = array(primitive["indices"]).reshape(-1, 3).astype(np.int64)
-    images = [Image.open(io.BytesIO(view(image["bufferView"]))) for image in document["images"]]
+    arrays = {name: gltf.array_of(document, binary, index) for name, index in primitive["attributes"].items()}
+    arrays["faces"] = gltf.array_of(document, binary, primitive["indices"]).reshape(-1, 3).astype(np.int64)
+    views = (gltf.view_of(document, binary, image["bufferView"]) for image in document["images"])
+    images = [Image.open(io.BytesIO(view)) for view in views]
     assert all(image.format == "PNG" and image.mode == "RGB" for image in images)
     return arrays, [np.asarray(image) / 255.0 for image in images]
 

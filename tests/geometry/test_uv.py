@@ -12,14 +12,13 @@ from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.topology import face_neighbors
 from reli3d.geometry.uv import guard_band, source_vertices, unwrap, unwrap_xatlas
-from tests.support.meshes import QUICK, SLOW, loaded, mesh_of
+from tests.support.meshes import QUICK, SLOW, loaded, mesh_from, mesh_of
 
 slow = pytest.mark.slow
 
 
 def icosphere(subdivisions: int) -> Mesh:
-    ball = trimesh.creation.icosphere(subdivisions)
-    return mesh_of(ball.vertices, ball.faces)
+    return mesh_from(trimesh.creation.icosphere(subdivisions))
 
 
 def ramp(turns: int, steps: int = 12) -> Mesh:
@@ -120,8 +119,7 @@ def test_extracted_surfaces_up_to_a_hundred_thousand_faces(n):
 
 
 def test_a_long_part_does_not_hold_down_the_scale():
-    bar = trimesh.creation.box((30.0, 1.0, 1.0)).subdivide().subdivide().subdivide()
-    mesh = mesh_of(bar.vertices, bar.faces)
+    mesh = mesh_from(trimesh.creation.box((30.0, 1.0, 1.0)).subdivide().subdivide().subdivide())
     result = unwrap(mesh, texture_size=512)
     check_atlas(mesh, result)
     # 122 units of area; uncut, the longest chart's 30 units would span the side and use 122 / 900 of it
@@ -168,16 +166,8 @@ def test_a_slab_folded_over_itself_is_distinguished():
 
 def test_degenerate_non_manifold_and_repeated_faces(device):
     vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0.5, 0, 0], [5, 5, 5]]
-    faces = [
-        [0, 1, 2],
-        [0, 1, 3],
-        [0, 1, 4],
-        [0, 1, 2],
-        [0, 2, 1],  # five faces at one edge, one twice, one turned
-        [0, 5, 1],
-        [3, 3, 1],
-        [2, 2, 2],
-    ]  # in line, two corners, one corner; vertex 6 unused
+    faces = [[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 1, 2], [0, 2, 1]]  # five at one edge, one twice, one turned
+    faces += [[0, 5, 1], [3, 3, 1], [2, 2, 2]]  # in line, two corners, one corner; vertex 6 unused
     mesh = mesh_of(vertices, faces)
     check_atlas(mesh, unwrap(mesh, texture_size=256), size=1024)
 

@@ -8,6 +8,7 @@ from torch.nn.functional import normalize
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import MIN_COSINE, visible_from
+from tests.support.meshes import mesh_from
 
 SIZE, FOCAL = 64, 90.0
 
@@ -41,13 +42,8 @@ def closed_form(p, n, camera):
 def test_a_ball_is_seen_where_it_faces_the_camera_within_the_image(device, backend, size):
     if backend == "embree" and device.type != "cpu":
         pytest.skip("Embree runs on the CPU")
-    ball = trimesh.creation.icosphere(5)
     # 1.001: the facets of the ball, 4e-4 deep, stay below the points; a ray that grazes less than 0.05 + 0.03 leaves it
-    scene = RayScene(
-        torch.tensor(ball.vertices, dtype=torch.float32, device=device),
-        torch.tensor(ball.faces, dtype=torch.int32, device=device),
-        backend=backend,
-    )
+    scene = RayScene(mesh_from(trimesh.creation.icosphere(5), device), backend=backend)
     camera, p = rig(device, *size), points(device)
     got = visible_from(scene, p * 1.001, p, camera)
     expected, unsure = closed_form(p * 1.001, p, camera)
@@ -71,9 +67,8 @@ def test_occluders_hide(device):
 @pytest.mark.parametrize("fraction", [0.0, 0.1, 1.0])
 def test_inactive_pairs_are_false_and_the_others_unchanged(device, fraction):
     camera, p = rig(device), points(device)
-    ball = trimesh.creation.icosphere(3)  # below some of the points: all answers occur
-    vertices = torch.tensor(ball.vertices, dtype=torch.float32, device=device)
-    scene = RayScene(vertices, torch.tensor(ball.faces, dtype=torch.int32, device=device))
+    # below some of the points: all answers occur
+    scene = RayScene(mesh_from(trimesh.creation.icosphere(3), device))
     every = visible_from(scene, p, p, camera)
     active = (torch.rand(every.shape, generator=torch.Generator().manual_seed(1)) < fraction).to(device)
     got = visible_from(scene, p, p, camera, active)

@@ -9,20 +9,19 @@ import torch
 import trimesh
 from PIL import Image
 
-from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.uv import unwrap
 from reli3d.io.obj import obj_files
 from reli3d.io.usd import usdz_bytes
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb
+from tests.support.meshes import mesh_from
 
 SIZE = 64
 
 
 @pytest.fixture(scope="module")
 def asset() -> Asset:
-    ball = trimesh.creation.icosphere(2)
-    mesh = Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int32))
+    mesh = mesh_from(trimesh.creation.icosphere(2))
     row, column = torch.meshgrid(torch.linspace(0, 1, SIZE), torch.linspace(0, 1, SIZE), indexing="ij")
     color = torch.stack([row, column, torch.full_like(row, 0.2)], -1)  # different at top and bottom
     flat = torch.tensor([0.5, 0.5, 1.0]).expand(SIZE, SIZE, 3).contiguous()

@@ -25,6 +25,8 @@ from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import glb_bytes, read_glb, write_glb
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
+from tests.support.gltf import packed, parsed
+from tests.support.meshes import loaded, mesh_from
 
 SIZE = 128
 STEP = 1 / 255
@@ -42,9 +44,7 @@ def color(p):
 
 @pytest.fixture(scope="module")
 def asset() -> Asset:
-    ball = trimesh.creation.icosphere(3)
-    mesh = Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int32))
-    mesh = unwrap(mesh, texture_size=SIZE).with_tangents()
+    mesh = unwrap(mesh_from(trimesh.creation.icosphere(3)), texture_size=SIZE).with_tangents()
 
     def fn(p, n, t):
         bumped = torch.nn.functional.normalize(n + 0.2 * torch.sin(6 * p), dim=1)
@@ -57,18 +57,6 @@ def asset() -> Asset:
         }
 
     return Asset(mesh, TextureSet(**bake(mesh, SIZE, fn, tangents=True)))
-
-
-def parsed(data: bytes) -> tuple[dict, bytes]:
-    size = struct.unpack_from("<I", data, 12)[0]
-    return json.loads(data[20 : 20 + size]), data[28 + size :]
-
-
-def packed(document: dict, binary: bytes) -> bytes:
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
-    return b"".join([head, text, struct.pack("<I4s", len(binary), b"BIN\0"), binary])
 
 
 def judged(path) -> dict:
@@ -103,9 +91,7 @@ def test_webp_textures_are_smaller_exact_and_valid(asset, tmp_path):
 
 
 def test_khronos_validator_on_a_real_mesh(shared_data, tmp_path):
-    shape = trimesh.load(shared_data / "meshes" / "scifi_crate.glb", force="mesh", process=False)
-    mesh = Mesh(torch.tensor(shape.vertices, dtype=torch.float32), torch.tensor(shape.faces, dtype=torch.int32))
-    mesh = unwrap(mesh, texture_size=64).with_tangents()
+    mesh = unwrap(loaded(shared_data / "meshes" / "scifi_crate.glb"), texture_size=64).with_tangents()
     plain = torch.full((64, 64, 3), 0.5)
     write_glb(tmp_path / "a.glb", Asset(mesh, TextureSet(plain, 0.5, 0.5, plain)))
     issues = judged(tmp_path / "a.glb")

@@ -1,14 +1,10 @@
 """glTF 2.0 and its extensions, on quads with ground truth by construction."""
 
-import io
-import json
 import math
-import struct
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from reli3d.errors import InputError
 from reli3d.io.glb import read_glb, write_glb
@@ -18,28 +14,18 @@ from reli3d.io.usd import usdz_bytes
 from reli3d.render.asset import Asset
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.gbuffer import surface_points
+from tests.support.gltf import Builder
 
 CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
 UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)  # upright: v is down
 FACES = np.array([0, 1, 2, 0, 2, 3], np.uint16)
-CODES = {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125, "i1": 5120, "i2": 5122}
-KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 
 
-class Quad:
+class Quad(Builder):
     """A GLB of one quad; ``document`` may be changed before :meth:`read`."""
 
     def __init__(self, **material):
-        self.binary = b""
-        self.document = {
-            "asset": {"version": "2.0"},
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
-            "accessors": [],
-            "bufferViews": [],
-            "images": [],
-            "textures": [],
-        }
+        super().__init__()
         self.attributes = {"POSITION": self.accessor(CORNERS), "NORMAL": self.accessor(np.float32([[0, 0, 1]] * 4))}
         self.primitive = {"attributes": self.attributes, "indices": self.accessor(FACES)}
         self.document["meshes"] = [{"primitives": [self.primitive]}]
@@ -48,41 +34,12 @@ class Quad:
             self.primitive["material"] = 0
             self.document["materials"] = [material]
 
-    def view(self, data: bytes) -> int:
-        self.document["bufferViews"].append({"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)})
-        self.binary += data + bytes(-len(data) % 4)
-        return len(self.document["bufferViews"]) - 1
-
-    def accessor(self, values: np.ndarray, **fields) -> int:
-        width = values.shape[1] if values.ndim == 2 else 1
-        entry = {"bufferView": self.view(values.tobytes()), "componentType": CODES[values.dtype.str[1:]]}
-        self.document["accessors"].append({**entry, "count": len(values), "type": KINDS[width], **fields})
-        return len(self.document["accessors"]) - 1
-
-    def texture(self, pixels: np.ndarray, **sampler) -> dict:
-        """Adds a texture; returns its info."""
-        data = io.BytesIO()
-        Image.fromarray(pixels).save(data, "PNG")
-        self.document["images"].append({"bufferView": self.view(data.getvalue()), "mimeType": "image/png"})
-        samplers = self.document.setdefault("samplers", [])
-        samplers.append(sampler)
-        self.document["textures"].append({"source": len(self.document["images"]) - 1, "sampler": len(samplers) - 1})
-        return {"index": len(self.document["textures"]) - 1}
-
     def material(self) -> dict:
         return self.document["materials"][0]
 
-    def write(self, path) -> None:
-        document = {**self.document, "buffers": [{"byteLength": len(self.binary)}]}
-        text = json.dumps({k: v for k, v in document.items() if v != []}).encode()
-        text += b" " * (-len(text) % 4)
-        chunks = struct.pack("<I4s", len(text), b"JSON") + text
-        chunks += struct.pack("<I4s", len(self.binary), b"BIN\0") + self.binary
-        path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
-
     def read(self, folder) -> tuple[Asset, list[str]]:
         notes: list[str] = []
-        self.write(folder / "a.glb")
+        (folder / "a.glb").write_bytes(self.data())
         (asset,) = read_glb(folder / "a.glb", notes=notes)
         assert all(note.startswith("a.glb: ") for note in notes)
         return asset, [note[7:] for note in notes]
@@ -348,7 +305,7 @@ def test_omissions_are_noted_once(tmp_path):
     quad.document["materials"].append({"alphaMode": "MASK"})
     quad.document["meshes"][0]["primitives"] += [{**quad.primitive, "material": 1}, {**quad.primitive, "mode": 0}]
     quad.document["animations"] = [{"channels": [], "samplers": []}]
-    quad.write(tmp_path / "a.glb")
+    (tmp_path / "a.glb").write_bytes(quad.data())
     notes: list[str] = []
     assert len(read_glb(tmp_path / "a.glb", notes=notes)) == 2
     left = ["animation", "alpha", "emission", "occlusionTexture", "what consists of points or lines"]

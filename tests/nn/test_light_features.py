@@ -19,20 +19,9 @@ def spherical(n: torch.Tensor) -> torch.Tensor:
     n = n.double()
     theta, phi = torch.acos(n[:, 2].clamp(-1, 1)), torch.atan2(n[:, 1], n[:, 0])
     s, c = theta.sin(), theta.cos()
-    return torch.stack(
-        [
-            torch.ones_like(s),
-            c,
-            s * phi.cos(),
-            s * phi.sin(),
-            3 * c * c - 1,
-            s * c * phi.cos(),
-            s * c * phi.sin(),
-            s * s * (2 * phi).cos(),
-            s * s * (2 * phi).sin(),
-        ],
-        -1,
-    )
+    first = [c, s * phi.cos(), s * phi.sin()]
+    second = [3 * c * c - 1, *(s * f for f in (c * phi.cos(), c * phi.sin(), s * (2 * phi).cos(), s * (2 * phi).sin()))]
+    return torch.stack([torch.ones_like(s), *first, *second], -1)
 
 
 def test_the_polynomials_span_the_spherical_harmonics():

@@ -8,8 +8,9 @@ import torch
 
 from reli3d.nn.presets import OFFICIAL
 from reli3d.nn.reni import EnvironmentDecoder, from_published, reni_frame, to_published
-from reli3d.nn.weights import WeightsError, read_manifest, read_tensors
+from reli3d.nn.weights import WeightsError, read_manifest
 from reli3d.render.latlong import lat_long_directions
+from tests.support.networks import published_decoder
 
 # Float32 through six norms, then exp; measured 6e-6 of the value.  The bound is the required one.
 MAP = dict(rtol=1e-4, atol=1e-6)
@@ -17,10 +18,7 @@ MAP = dict(rtol=1e-4, atol=1e-6)
 
 @pytest.fixture
 def decoder(goldens):
-    decoder = EnvironmentDecoder(OFFICIAL.reni)
-    manifest = read_manifest(goldens.parent / "reni++L49.safetensors")
-    decoder.field.load_state_dict(read_tensors(manifest, {name: torch.float32 for name in manifest.tensors}))
-    return decoder.eval()
+    return published_decoder(goldens)
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import torch
 from reli3d.nn.presets import OFFICIAL
 from reli3d.nn.reni import EnvironmentDecoder
 from reli3d.nn.reni_fit import fit_latent
-from reli3d.nn.weights import read_manifest, read_tensors
+from tests.support.networks import published_decoder
 
 
 @pytest.fixture(params=["random", "published"])
@@ -16,10 +16,7 @@ def decoder(request, device):
     if request.param == "random":
         torch.manual_seed(0)
         return EnvironmentDecoder(OFFICIAL.reni).to(device).eval()
-    path = request.getfixturevalue("goldens").parent / "reni++L49.safetensors"
-    decoder, manifest = EnvironmentDecoder(OFFICIAL.reni), read_manifest(path)
-    decoder.field.load_state_dict(read_tensors(manifest, {name: torch.float32 for name in manifest.tensors}))
-    return decoder.eval().to(device)
+    return published_decoder(request.getfixturevalue("goldens")).to(device)
 
 
 def code(seed, device, spread=1.0):
@@ -34,9 +31,8 @@ def test_a_decoded_map_is_found_again(decoder, height):
     device = decoder.sample_directions.device
     latent, _, _ = code(7, device)
     with torch.no_grad():
-        radiance = decoder(
-            latent[None], torch.eye(3, device=device)[None], torch.full((1,), 2.0, device=device), height
-        )
+        eye, strength = torch.eye(3, device=device)[None], torch.full((1,), 2.0, device=device)
+        radiance = decoder(latent[None], eye, strength, height)
     before = [p.clone() for p in decoder.parameters()]
     fit = fit_latent(decoder, radiance[0], steps=120)
     spread = float((radiance.log() - radiance.log().mean()).abs().mean())

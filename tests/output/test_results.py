@@ -161,15 +161,8 @@ def test_of_two_processes_one_reports_it_at_its_start(tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="needs locks of files")
 def test_many_processes_at_one_result_leave_one_of_theirs(tmp_path):
     folder = tmp_path / "name"
-    running = [
-        subprocess.Popen(
-            [sys.executable, "-c", WRITER, folder, str(k), "0"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for k in range(6)
-    ]
+    pipes = dict(stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    running = [subprocess.Popen([sys.executable, "-c", WRITER, folder, str(k), "0"], **pipes) for k in range(6)]
     output = [process.communicate()[1] for process in running]
     assert any(process.returncode == 0 for process in running)
     for process, text in zip(running, output, strict=True):

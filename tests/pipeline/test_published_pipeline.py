@@ -16,33 +16,21 @@ from reli3d.nn import field
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.published import our_key
-from reli3d.nn.weights import load_model, published_state, read_manifest, read_tensors, save
+from reli3d.nn.weights import load_model, save
 from reli3d.output import results
 from reli3d.pipeline import NoSurface, ReconstructOptions, default_normalization, prepare, reconstruct
 from reli3d.views.folder import load_views
 from reli3d.views.published_views import published_views
 from reli3d.views.similarity import Similarity
-from tests.support.checkout import SHARED
-from tests.support.networks import NANO, TINY, views
+from tests.support.networks import NANO, TINY, golden_tiny, views
 
 EXAMPLE = load_views(infer.EXAMPLE, views=2)
 
 
 @pytest.fixture(scope="module")
-def tiny():
+def tiny(goldens):
     """The network of the golden ``tiny_system``: its field crosses the threshold all over the cube."""
-    goldens = SHARED / "reference" / "goldens"
-    if not goldens.is_dir():
-        pytest.skip("needs the folder ../shared/reference/goldens next to the checkout")
-    model = Reconstructor(TINY).eval()
-    with np.load(goldens / "tiny_system.npz") as file:
-        stored = {k[6:]: torch.from_numpy(file[k]) for k in file.files if k.startswith("param.")}
-        state = published_state(stored, "golden")
-    published = read_manifest(goldens.parent / "reni++L49.safetensors")
-    reni = read_tensors(published, {name: torch.float32 for name in published.tensors})
-    state |= {"environment.field." + k: v for k, v in reni.items()}
-    model.load_state_dict(state | {"environment.sample_directions": model.environment.sample_directions}, strict=True)
-    return model
+    return golden_tiny(goldens)[0]
 
 
 @torch.no_grad()
@@ -183,21 +171,8 @@ def test_exported_roughness_is_the_root_of_the_published_number(tiny, asset):
 def test_the_command_takes_published_weights_and_reports_how_it_used_them(tiny, tmp_path, capsys):
     weights = tmp_path / "tiny.safetensors"
     save(weights, tiny, license="of the test", dtype=torch.float32)
-    arguments = [
-        str(infer.EXAMPLE),
-        "--weights",
-        str(weights),
-        "--output",
-        str(tmp_path / "out"),
-        "--device",
-        "cpu",
-        "--views",
-        "2",
-        "--texture-size",
-        "256",
-        "--resolution",
-        "16",
-    ]
+    places = [str(infer.EXAMPLE), "--weights", str(weights), "--output", str(tmp_path / "out")]
+    arguments = places + ["--device", "cpu", "--views", "2", "--texture-size", "256", "--resolution", "16"]
     assert infer.main([*arguments, "--hero", "1", "--background", "visible", "--precision", "bfloat16"]) == 0
     folder = tmp_path / "out" / "example"
     assert sorted(p.name for p in folder.iterdir()) == sorted(results.FILES)

@@ -25,15 +25,14 @@ from reli3d.nn.reni import from_published
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions
+from tests.support.meshes import mesh_from
 
 SIZE = 128
 
 
 @pytest.fixture(scope="module")
 def ball() -> Mesh:
-    shape = trimesh.creation.icosphere(2)
-    mesh = Mesh(torch.tensor(shape.vertices, dtype=torch.float32), torch.tensor(shape.faces, dtype=torch.int32))
-    return unwrap(mesh.with_normals(), texture_size=SIZE).with_tangents()
+    return unwrap(mesh_from(trimesh.creation.icosphere(2)).with_normals(), texture_size=SIZE).with_tangents()
 
 
 def degrees(a, b):

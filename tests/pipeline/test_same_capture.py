@@ -23,6 +23,11 @@ EXAMPLE = Path(reli3d.__file__).parent / "assets/example"
 FORMS = ("release", "nerfstudio", "instant-ngp", "colmap_text", "colmap_binary")
 
 
+def lens(intrinsics: torch.Tensor, width: int, height: int) -> dict:
+    keys = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    return dict(zip(keys, (*intrinsics.double().tolist(), width, height), strict=True))
+
+
 def write_form(folder: Path, form: str) -> Path:
     """The bundled example as ``form`` has it: images in ``images/``, one lens for all."""
     views = load_views(EXAMPLE)
@@ -32,37 +37,17 @@ def write_form(folder: Path, form: str) -> Path:
     poses = views.c2w.double().numpy()
     names = [Path(name).name for name in views.names]
     frames = [{"file_path": f"images/{n}", "transform_matrix": p.tolist()} for n, p in zip(names, poses)]
+    fov = [2 * math.atan(0.5 * width / fx), 2 * math.atan(0.5 * height / fy)]
+    pinhole = lens(views.intrinsics[0], width, height)
     if form == "release":
-        fov = [2 * math.atan(0.5 * width / fx), 2 * math.atan(0.5 * height / fy)]
         data = {"frames": [f | {"camera_fov": fov, "camera_principal_point": [cx, cy]} for f in frames]}
     elif form == "nerfstudio":
-        data = {
-            "camera_model": "OPENCV",
-            "fl_x": fx,
-            "fl_y": fy,
-            "cx": cx,
-            "cy": cy,
-            "w": width,
-            "h": height,
-            "k1": 0.0,
-            "k2": 0.0,
-            "p1": 0.0,
-            "p2": 0.0,
-            "frames": frames,
-        }
+        undistorted = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
+        data = {"camera_model": "OPENCV", **pinhole, **undistorted, "frames": frames}
     elif form == "instant-ngp":
-        data = {
-            "camera_angle_x": 2 * math.atan(0.5 * width / fx),
-            "camera_angle_y": 2 * math.atan(0.5 * height / fy),
-            "fl_x": fx,
-            "fl_y": fy,
-            "cx": cx,
-            "cy": cy,
-            "w": float(width),
-            "h": float(height),
-            "aabb_scale": 4,
-            "frames": [f | {"sharpness": 30.0} for f in frames],
-        }
+        angles = dict(zip(("camera_angle_x", "camera_angle_y"), fov, strict=True))
+        data = {**angles, **pinhole, "w": float(width), "h": float(height), "aabb_scale": 4}
+        data["frames"] = [f | {"sharpness": 30.0} for f in frames]
     else:
         write_colmap(folder / "sparse/0", form, names, poses, (width, height), (fx, fy, cx, cy))
         return folder
@@ -138,19 +123,8 @@ def test_many_photographs_from_one_place_do_not_hide_the_others(tmp_path):
         for k, (image, mask) in enumerate(zip(views.images, views.masks)):
             pixels = torch.cat([image, mask[..., None]], -1).mul(255).round().byte().numpy()
             Image.fromarray(pixels).save(tmp_path / name / f"{k}.png")
-            fx, fy, cx, cy = views.intrinsics[k].double().tolist()
-            frames.append(
-                {
-                    "file_path": f"{k}.png",
-                    "transform_matrix": views.c2w[k].double().tolist(),
-                    "fl_x": fx,
-                    "fl_y": fy,
-                    "cx": cx,
-                    "cy": cy,
-                    "w": 128,
-                    "h": 128,
-                }
-            )
+            pose = {"file_path": f"{k}.png", "transform_matrix": views.c2w[k].double().tolist()}
+            frames.append(pose | lens(views.intrinsics[k], 128, 128))
         (tmp_path / name / "transforms.json").write_text(json.dumps({"frames": frames}))
         loaded = load_views(tmp_path / name)
         assert len(loaded) <= 16 and loaded.in_folder == len(eyes)

@@ -17,6 +17,7 @@ from reli3d.prepare import completed, prepare
 from reli3d.views.normalize import normalize
 from reli3d.views.views import Views
 from tests.support.meshes import mesh_from
+from tests.support.reference_surface import grid
 
 SIZE = 192
 BALLS = [((0.0, 0.0, 0.0), 0.3), ((0.35, 0.1, 0.25), 0.14), ((-0.35, 0.1, 0.25), 0.14), ((0.0, 0.3, -0.2), 0.14)]
@@ -51,8 +52,7 @@ def views():
 
 def overlap(asset):
     """Intersection over union of mesh and balls on a grid; a point is inside where rays leave through the mesh."""
-    axis = torch.linspace(-0.55, 0.55, 45)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    points = grid(44, 0.55).reshape(-1, 3)
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
     direction = torch.tensor([0.211, 0.943, 0.257]).expand_as(points).contiguous()
     hit = scene.closest(points, direction)

@@ -67,17 +67,8 @@ def test_the_kernel_of_the_contributors_page_works_in_the_package(tmp_path):
     assert len(paths) == 4 == len(blocks(ROOT / "CONTRIBUTING.md"))
     env = {**os.environ, "PYTHONPATH": str(tmp_path)}
     bench = "from bench.solid_angle import CASES; build, options = CASES['angles']; build('cpu', n=1000)[0]()"
-    tests = [
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "tests/geometry/test_solid_angle.py",
-        "tests/project/test_structure.py",
-        "-k",
-        "solid_angle",
-    ]
+    files = ["tests/geometry/test_solid_angle.py", "tests/project/test_structure.py"]
+    tests = ["-m", "pytest", "-q", "-p", "no:cacheprovider", *files, "-k", "solid_angle"]
     for command in (tests, ["-c", bench]):
         done = subprocess.run([sys.executable, *command], cwd=tmp_path, env=env, capture_output=True, text=True)
         assert done.returncode == 0, done.stdout + done.stderr

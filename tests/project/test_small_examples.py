@@ -126,14 +126,7 @@ def test_the_examples_of_the_public_names_run(tmp_path, monkeypatch):
         exec(SNIPPETS[0], names)
         scene, light, normal = names["mesh"], names["light"], torch.nn.functional.normalize(torch.randn(8, 3), dim=-1)
         names |= {"u": torch.rand(8, 2), "alpha": torch.tensor(0.25), "metallic": torch.tensor(0.5)}
-        names |= {
-            "wo": normal,
-            "wi": normal,
-            "wm": normal,
-            "normal": normal,
-            "position": normal,
-            "color": torch.ones(3),
-        }
+        names |= {**dict.fromkeys(("wo", "wi", "wm", "normal", "position"), normal), "color": torch.ones(3)}
         names |= dict(zip(("origins", "directions"), reli3d.camera_rays(names["camera"]), strict=True))
         names |= {"v": scene.vertices.clone().requires_grad_(), "scene": reli3d.RayScene(scene)}
         maps = reli3d.TextureSet(torch.full((64, 64, 3), 0.5), 0.5, 0.0)

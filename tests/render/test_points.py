@@ -43,15 +43,8 @@ def test_values_that_are_not_finite_give_nan_in_their_row_only(device, name, val
     normal, wo = (v.to(device) for v in points(40))
     light = Environment(sky().radiance.to(device))
     lobe = SphericalGaussians(normal[:1], normal.new_tensor([3.0]), normal.new_ones(1, 3))
-    values = dict(
-        position=0.3 * normal,
-        ng=normal,
-        normal=normal,
-        base_color=normal.abs(),
-        roughness=normal[:, 0].abs(),
-        metallic=normal[:, 1].abs(),
-        wo=wo,
-    )
+    finish = dict(base_color=normal.abs(), roughness=normal[:, 0].abs(), metallic=normal[:, 1].abs())
+    values = dict(position=0.3 * normal, ng=normal, normal=normal, **finish, wo=wo)
     broken = {k: v.clone() for k, v in values.items()}
     broken[name][7].fill_(value) if broken[name].ndim == 1 else broken[name][7, 1:2].fill_(value)
     calls = [

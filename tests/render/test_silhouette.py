@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.rays import RayScene
 from reli3d.render.silhouette import antialias, blend_outlines, mesh_edges, outline_crossings
+from tests.support.meshes import mesh_from
 
 SIZE = 48
 TURN = trimesh.transformations.euler_matrix(0.4, 0.7, 0.2)[:3, :3]
@@ -29,10 +30,8 @@ def shape(name, device):
         mesh.vertices = mesh.vertices @ TURN.T
     else:  # 20 thousand faces on 28 pixels across: at the outline they are far smaller than a pixel
         mesh = trimesh.creation.icosphere(subdivisions=5 if name == "fine sphere" else 2, radius=0.6)
-    return (
-        torch.tensor(mesh.vertices, dtype=torch.float32, device=device),
-        torch.tensor(mesh.faces, dtype=torch.int32, device=device),
-    )
+    mesh = mesh_from(mesh, device)
+    return mesh.vertices, mesh.faces
 
 
 def layer_of_hits(scene, camera, value=None):
@@ -198,10 +197,7 @@ def test_hidden_outlines_do_not_move_and_colors_blend_between_neighbors(device):
             with torch.no_grad():
                 expected = float(((sampled(vertices + step) - sampled(vertices - step)) * weight).sum()) / 0.06
             # of 730; a row at the end of an edge is 20
-            assert abs(float(g[k, axis].sum()) - expected) < 30.0, (
-                k,
-                axis,
-            )
+            assert abs(float(g[k, axis].sum()) - expected) < 30.0, (k, axis)
 
 
 def test_edges_of_split_vertices_and_open_borders(device):

@@ -11,6 +11,7 @@ from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
 from reli3d.render.transfer import blocked_transfer, light_harmonics, sphere_spiral, spherical_harmonics
+from tests.support.meshes import mesh_from
 
 COSINE = torch.tensor([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5 + [0.0] * 7).double()  # an open plane's
 
@@ -28,11 +29,6 @@ def quadrature(rows=64):
 def some_normals(count):
     rng = torch.Generator().manual_seed(3)
     return torch.nn.functional.normalize(torch.randn(count, 3, generator=rng).double(), dim=-1)
-
-
-def mesh_of(shape: trimesh.Trimesh, device="cpu") -> Mesh:
-    vertices, faces = torch.tensor(shape.vertices).float(), torch.tensor(shape.faces).int()
-    return Mesh(vertices.to(device), faces.to(device)).with_normals()
 
 
 def test_harmonics_are_orthonormal_and_begin_with_the_axes():
@@ -70,7 +66,7 @@ def test_a_light_gives_an_open_plane_the_irradiance_of_its_map():
 
 def test_a_convex_surface_hides_nothing_from_itself(device):
     for shape in (trimesh.creation.icosphere(subdivisions=4), trimesh.creation.box()):
-        assert blocked_transfer(mesh_of(shape, device)).abs().max() == 0.0
+        assert blocked_transfer(mesh_from(shape, device).with_normals()).abs().max() == 0.0
 
 
 def test_a_wall_occludes_half_of_the_hemisphere_of_a_floor(device):
@@ -100,7 +96,7 @@ def test_missing_irradiance_is_that_of_a_monte_carlo_estimate(device):
     dish.invert()  # its inside
     dish.remove_unreferenced_vertices()
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.35)
-    mesh = mesh_of(trimesh.util.concatenate([dish, ball]), device)
+    mesh = mesh_from(trimesh.util.concatenate([dish, ball]), device).with_normals()
     light = smooth_light(3)[0].to(device)
     rng = torch.Generator().manual_seed(5)
     chosen = torch.randperm(len(mesh.vertices), generator=rng)[:40].to(device)
@@ -126,7 +122,7 @@ def test_the_spiral_sums_as_an_integral_does():
 
 
 def test_invalid_inputs_are_refused():
-    box = mesh_of(trimesh.creation.box())
+    box = mesh_from(trimesh.creation.box()).with_normals()
     with pytest.raises(ValueError, match="directions: expected at least 1, got 0"):
         blocked_transfer(box, directions=0)
     with pytest.raises(ValueError, match="normals: expected a value, got None"):

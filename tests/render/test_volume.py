@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.render.volume import OccupancyGrid, composite, march_rays
 from tests.support.rays import packed
-from tests.support.reference import fraction_within
+from tests.support.reference import fraction_within, grid_samples
 
 
 def rays(device, n=64, seed=0, radius=0.8):
@@ -119,15 +119,6 @@ def test_composite_and_gradients_match_the_float64_reference(device):
         torch.testing.assert_close(g.cpu().double(), t, rtol=1e-4, atol=2e-6)
 
 
-def planes_read(planes, points):
-    """Float64 reference of :func:`reli3d.geometry.triplane.sample_triplane`, ``(S, 3 C)``."""
-    out = []
-    for plane, axes in zip(planes[0], ((0, 1), (0, 2), (1, 2)), strict=True):
-        grid = points[:, axes][None, None]
-        out.append(torch.nn.functional.grid_sample(plane[None], grid, align_corners=False)[0, :, 0].T)
-    return torch.cat(out, 1)
-
-
 def test_a_triplane_is_marched_and_composited_as_in_float64(device):
     """The first training stage: occupancy of the field, samples, features, heads, color and opacity of rays; values
     and gradients to planes and heads, as docs/library.md joins them."""
@@ -137,19 +128,18 @@ def test_a_triplane_is_marched_and_composited_as_in_float64(device):
     planes, heads = (v.to(device).requires_grad_() for v in leaves)
 
     def field(points, planes, heads, read):
-        value = read(planes, points / radius) @ heads.T
+        value = read(planes, points[None] / radius)[0] @ heads.T
         return torch.nn.functional.softplus(6.0 * value[:, 0] - 12.0), torch.sigmoid(value[:, 1:])
 
-    read = lambda planes, points: sample_triplane(planes, points[None])[0]  # noqa: E731
-    density_at = lambda points: field(points, planes, heads, read)[0]  # noqa: E731
+    density_at = lambda points: field(points, planes, heads, sample_triplane)[0]  # noqa: E731
     grid = OccupancyGrid.of_density(density_at, 16, radius, threshold=1.0, device=device)
     origins, directions = rays(device, 300, 9)
     samples = march_rays(origins, directions, grid, 0.02)
     assert 0.2 < float(grid.occupied.float().mean()) < 0.9 and len(samples.t) > 3000
-    out = composite(*field(samples.positions(origins, directions), planes, heads, read), samples)
+    out = composite(*field(samples.positions(origins, directions), planes, heads, sample_triplane), samples)
     far = [v.double().requires_grad_() for v in leaves]
     o, d, t, ray = (v.cpu() for v in (origins.double(), directions.double(), samples.t.double(), samples.ray.long()))
-    expected = in_float64(samples, *field(o[ray] + t[:, None] * d[ray], *far, planes_read))
+    expected = in_float64(samples, *field(o[ray] + t[:, None] * d[ray], *far, grid_samples))
     weight = [torch.rand(v.shape, generator=rng) for v in expected[:2]]
     loss = ref = 0.0
     for got, exact, w in zip((out.color, out.opacity), expected, weight):

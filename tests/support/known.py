@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import math
@@ -16,13 +15,9 @@ from random import Random
 
 import numpy as np
 import OpenEXR
-import torch
-import trimesh
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
-import reli3d
-from reli3d.geometry.camera import project
-from reli3d.geometry.mesh import vertex_normals
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_hdr_image
 from reli3d.views.folder import load_views
@@ -239,20 +234,6 @@ def lens(rng: Random) -> Case:
     return Case(files, lambda f: check_cameras(f, ground_truth), must_read=not unknown, must_refuse=bent)
 
 
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """``w, x, y, z`` of a rotation, by its largest eigenvector (Bar-Itzhack 2000)."""
-    m = rotation
-    k = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(k / 3)[1][:, -1]
-
-
 def colmap(rng: Random) -> Case:
     """COLMAP text models: without lines of points, with blank lines, CRLF, a BOM, comments, and two models."""
     width, height, count = 64, 48, rng.choice((4, 6, 7))
@@ -268,7 +249,8 @@ def colmap(rng: Random) -> Case:
         name = rng.choice((f"{k}.png", f"a b {k}.png", f"ü/{k}.png"))
         opencv = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
         view = np.linalg.inv(opencv)
-        numbers = " ".join(f"{v:.15g}" for v in (*quaternion(view[:3, :3]), *view[:3, 3]))
+        x, y, z, w = Rotation.from_matrix(view[:3, :3]).as_quat()
+        numbers = " ".join(f"{v:.15g}" for v in (w, x, y, z, *view[:3, 3]))
         rows.append(f"{k + 1} {numbers} {k + 1} {name}")
         files[f"images/{name}"] = rgba(rng, width, height)
         ground_truth[name] = ([fx, fy, cx, cy], pose)
@@ -438,94 +420,6 @@ def gltf(rng: Random) -> Case:
     return Case({"a.glb": content}, read, must_refuse=look.refused, must_read=look.plain)
 
 
-PARTS = (
-    "surface",
-    "triplane",
-    "atlas",
-    "normals",
-    "camera",
-    "rays",
-    "light",
-    "image",
-    "shading",
-)
-
-
-def operation(name: str, seed: int) -> list[torch.Tensor]:
-    """Results of a public operation on random inputs of explicit dtype and device."""
-    rng = torch.Generator("cpu").manual_seed(seed)
-
-    def random(*shape: int) -> torch.Tensor:
-        return torch.rand(shape, generator=rng, dtype=torch.float32, device="cpu")
-
-    pose = reli3d.look_at([0.3, 1.0, 2.5])
-    camera = reli3d.Camera.from_fov(pose, 0.8, 16, 12)
-    if name == "triplane":
-        return [reli3d.sample_triplane(random(1, 3, 4, 8, 8) - 0.5, random(1, 9, 3) - 0.5)]
-    if name == "camera":
-        pixels, depth = project(random(20, 3) - 0.5, camera.c2w, camera.intrinsics)
-        return [pose, camera.intrinsics, pixels, depth]
-    if name == "light":
-        light = reli3d.Environment(random(8, 16, 3) + 0.1)
-        return [light.rotated(0.7).radiance, light.lookup(pose[:3, 2].expand(4, 3))]
-    ball = trimesh.creation.icosphere(1)
-    mesh = reli3d.Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.int32))
-    if name == "surface":
-        axes = [torch.linspace(-1, 1, 9, dtype=torch.float32, device="cpu")] * 3
-        x, y, z = torch.meshgrid(*axes, indexing="ij")
-        found = reli3d.extract_surface((x**2 + y**2 + z**2).sqrt() - 0.6, radius=1.0)
-        return [found.vertices, found.faces]
-    if name == "normals":
-        return [vertex_normals(mesh.vertices, mesh.faces)]
-    if name == "rays":
-        hits = reli3d.RayScene(mesh.vertices, mesh.faces).closest(random(9, 3) + 2.0, -random(9, 3) - 2.0)
-        return [hits.face, hits.t, hits.bary]
-    textured = reli3d.unwrap(mesh, texture_size=64).with_tangents()
-    if name == "atlas":
-        return [textured.vertices, textured.uv]
-    light = reli3d.Environment(random(8, 16, 3) + 0.1)
-    if name == "shading":
-        normal = torch.nn.functional.normalize(random(9, 3), dim=-1)
-        points = reli3d.SurfacePoints(random(9, 3), normal, normal, random(9, 3), 0.5, 0.25)
-        return [reli3d.shade(points, normal, light)]
-    maps = reli3d.TextureSet(random(64, 64, 3), 0.5, 0.25)
-    return [reli3d.render_asset(reli3d.Asset(textured, maps), camera, light).radiance]
-
-
-STATES = ("autocast", "dtype", "device")
-
-
-@contextlib.contextmanager
-def torch_state(name: str):
-    """A global state of torch that another program may have set; meta represents a GPU."""
-    dtype = torch.get_default_dtype()
-    try:
-        if name == "dtype":
-            torch.set_default_dtype(torch.float64)
-        elif name == "device":
-            torch.set_default_device("meta")
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=name == "autocast"):
-            yield
-    finally:
-        torch.set_default_dtype(dtype)
-        torch.set_default_device(None)
-
-
-def torch_states(rng: Random) -> Case:
-    """A public operation under a global state of torch gives the bits that it gives without."""
-    name, state, seed = rng.choice(PARTS), rng.choice(STATES), rng.getrandbits(16)
-
-    def read(folder: Path) -> None:
-        expected = operation(name, seed)
-        with torch_state(state):
-            got = operation(name, seed)
-        for a, b in zip(got, expected, strict=True):
-            same = a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
-            check(same, f"{name} under {state}: {a.dtype} on {a.device}, another result")
-
-    return Case({}, read, must_read=True)
-
-
 KINDS: dict[str, Callable[[Random], Case]] = {
     "known masks": masks,
     "known names": names,
@@ -535,5 +429,4 @@ KINDS: dict[str, Callable[[Random], Case]] = {
     "known exr": exr,
     "known rgbe": rgbe,
     "known gltf": gltf,
-    "known torch state": torch_states,
 }

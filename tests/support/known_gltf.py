@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import io
-import json
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from random import Random
 
 import numpy as np
 import torch
-from PIL import Image
 
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.render.asset import Asset
 from reli3d.render.environment import Environment
 from reli3d.render.image import render_asset
 from reli3d.render.shading import Samples, ShadeOptions
+from tests.support.gltf import Builder
 from tests.support.misread import check
 
 CELLS, CELL, SIZE = 4, 32, 24  # blocks of one color a side, their texels, pixels of the view
@@ -58,40 +55,20 @@ def wrapped(t: np.ndarray, mode: int) -> np.ndarray:
 
 def quad(rng: Random) -> tuple[bytes, Look]:
     numbers = np.random.default_rng(rng.getrandbits(32))
-    binary, views, accessors = b"", [], []
-
-    def view(data: bytes) -> int:
-        nonlocal binary
-        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
-        binary += data + bytes(-len(data) % 4)
-        return len(views) - 1
-
-    def accessor(values: np.ndarray, kind: str, code: int, **more) -> int:
-        entry = {"bufferView": view(values.tobytes()), "componentType": code, "count": len(values), "type": kind}
-        accessors.append({**entry, **more})
-        return len(accessors) - 1
-
+    file = Builder()
     corners = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     uv_scale, uv_offset = rng.choice((1.0, 2.0)), rng.choice((0.03, -0.27))
     uv = np.float32([[0, 1], [1, 1], [1, 0], [0, 0]]) * np.float32(uv_scale) + np.float32(uv_offset)
     attributes = {
-        "POSITION": accessor(corners, "VEC3", 5126, min=[-1, -1, 0], max=[1, 1, 0]),
-        "NORMAL": accessor(np.float32([[0, 0, 1]] * 4), "VEC3", 5126),
-        "TEXCOORD_0": accessor(uv, "VEC2", 5126),
+        "POSITION": file.accessor(corners, min=[-1, -1, 0], max=[1, 1, 0]),
+        "NORMAL": file.accessor(np.float32([[0, 0, 1]] * 4)),
+        "TEXCOORD_0": file.accessor(uv),
     }
     extensions, used, required, plain = {}, [], [], True
     modes = [rng.choice(list(WRAPS)) for _ in range(2)]
     blocks = numbers.integers(20, 256, (CELLS, CELLS, 3), dtype=np.uint8)
-    images, textures = [], []
-
-    def texture(image: Image.Image) -> dict:
-        data = io.BytesIO()
-        image.save(data, "PNG")
-        images.append({"bufferView": view(data.getvalue()), "mimeType": "image/png"})
-        textures.append({"source": len(images) - 1, "sampler": 0})
-        return {"index": len(textures) - 1}
-
-    base = texture(Image.fromarray(blocks.repeat(CELL, 0).repeat(CELL, 1)))
+    wraps = {"wrapS": modes[0], "wrapT": modes[1]}
+    base = file.texture(blocks.repeat(CELL, 0).repeat(CELL, 1), **wraps)
     move, stretch, turn = np.zeros(2), np.ones(2), 0.0
     if rng.random() < 0.3:
         move = np.array([rng.choice((0.0, 0.25, 0.5)) for _ in range(2)])
@@ -110,19 +87,19 @@ def quad(rng: Random) -> tuple[bytes, Look]:
         pbr |= {"roughnessFactor": roughness, "metallicFactor": metallic}
     elif packed == "8 bits":
         rough, metal = rng.randrange(30, 256), rng.randrange(256)
-        pbr["metallicRoughnessTexture"] = texture(Image.new("RGB", (4, 4), (rng.randrange(256), rough, metal)))
+        pixels = np.full((4, 4, 3), (rng.randrange(256), rough, metal), np.uint8)
+        pbr["metallicRoughnessTexture"] = file.texture(pixels, **wraps)
         roughness, metallic = rough / 255, metal / 255
     else:
         gray = rng.randrange(8000, 65536)
-        pbr["metallicRoughnessTexture"] = texture(Image.fromarray(np.full((4, 4), gray, np.uint16)))
+        pbr["metallicRoughnessTexture"] = file.texture(np.full((4, 4), gray, np.uint16), **wraps)
         roughness = metallic = gray / 65535
     vertex = np.ones(3)
     if rng.random() < 0.4:
         vertex = np.array([rng.choice((0.2, 0.4, 0.6, 0.8, 1.0)) for _ in range(3)])
-        code, kind, top = rng.choice([(5121, np.uint8, 255), (5123, np.uint16, 65535), (5126, np.float32, 1)])
+        kind, top = rng.choice([(np.uint8, 255), (np.uint16, 65535), (np.float32, 1)])
         color = (np.append(vertex, 1.0) * top).astype(kind)[None].repeat(4, 0)
-        more = {} if top == 1 else {"normalized": True}
-        attributes["COLOR_0"] = accessor(color, "VEC4", code, **more)
+        attributes["COLOR_0"] = file.accessor(color, normalized=top != 1)
     material: dict = {"pbrMetallicRoughness": pbr}
     if rng.random() < 0.15:  # below the dielectric's reflectance, so that nothing is metal
         material = {"extensions": {SPEC_GLOSS: {"diffuseTexture": base, "diffuseFactor": [*factor, 1.0]}}}
@@ -146,32 +123,20 @@ def quad(rng: Random) -> tuple[bytes, Look]:
     if rng.random() < 0.2:  # a skin: the node's own transform is ignored, the joint's counts
         nodes = [{"mesh": 0, "skin": 0, "scale": [100.0] * 3}]
         nodes.append({"translation": shift.tolist(), "scale": [grow] * 3})
-        attributes["JOINTS_0"] = accessor(np.zeros((4, 4), np.uint8), "VEC4", 5121)
-        attributes["WEIGHTS_0"] = accessor(np.float32([[1, 0, 0, 0]] * 4), "VEC4", 5126)
+        attributes["JOINTS_0"] = file.accessor(np.zeros((4, 4), np.uint8))
+        attributes["WEIGHTS_0"] = file.accessor(np.float32([[1, 0, 0, 0]] * 4))
         extensions["skins"] = [{"joints": [1]}]
-    indices = accessor(np.uint16([0, 1, 2, 0, 2, 3]), "SCALAR", 5123)
-    document = {
-        "asset": {"version": "2.0"},
+    indices = file.accessor(np.uint16([0, 1, 2, 0, 2, 3]))
+    file.document |= {
         "scene": 0,
         "scenes": [{"nodes": [0, 1] if "skins" in extensions else [0]}],
         "nodes": nodes,
         "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
         "materials": [material],
-        "textures": textures,
-        "images": images,
-        "samplers": [{"wrapS": modes[0], "wrapT": modes[1]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(binary)}],
+        "extensionsUsed": used,
+        "extensionsRequired": required,
         **extensions,
     }
-    if used:
-        document["extensionsUsed"] = used
-    if required:
-        document["extensionsRequired"] = required
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
     def color(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         u, v = (((1 + t) / 2 * uv_scale + uv_offset) * s for t, s in ((x, stretch[0]), (-y, stretch[1])))
@@ -194,7 +159,7 @@ def quad(rng: Random) -> tuple[bytes, Look]:
         refused,
         plain and not used and not refused,
     )
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks, look
+    return file.data(), look
 
 
 def compare(parts: list[Asset], look: Look, notes: list[str]) -> None:

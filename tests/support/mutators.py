@@ -9,49 +9,11 @@ import zlib
 from collections.abc import Callable
 from random import Random
 
-VALUES = [
-    0,
-    -1,
-    1,
-    2,
-    0.5,
-    -0.0,
-    1e308,
-    -1e308,
-    5e-324,
-    1e-44,
-    1e30,
-    1e5,
-    2**31 - 1,
-    2**31,
-    2**32,
-    2**63,
-    -(2**63),
-    10**400,
-    math.nan,
-    math.inf,
-    -math.inf,
-    None,
-    True,
-    False,
-    "",
-    " ",
-    "\0",
-    "\ud800",
-    "x" * 300,
-    "y" * 5000,
-    "../../../etc/passwd",
-    "/dev/zero",
-    "file:///etc/passwd",
-    "data:,",
-    "rgba/1.png",
-    [],
-    {},
-    [[]],
-    [None],
-    [0] * 5000,
-    {"": {}},
-]
+VALUES = [0, -1, 1, 2, 0.5, -0.0, 1e308, -1e308, 5e-324, 1e-44, 1e30, 1e5]
+VALUES += [2**31 - 1, 2**31, 2**32, 2**63, -(2**63), 10**400, math.nan, math.inf, -math.inf, None, True, False]
+VALUES += ["", " ", "\0", "\ud800", "x" * 300, "y" * 5000]
+VALUES += ["../../../etc/passwd", "/dev/zero", "file:///etc/passwd", "data:,", "rgba/1.png"]
+VALUES += [[], {}, [[]], [None], [0] * 5000, {"": {}}]
 INTEGERS = [0, 1, 2, 3, 127, 128, 255, 256, 32767, 32768, 65535, 65536, 2**24, 2**31 - 1, 2**31, 2**32 - 1]
 LONGEST = 1 << 22  # bytes of a file that edits may reach
 

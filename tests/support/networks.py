@@ -1,9 +1,11 @@
-"""Sizes of networks that run in seconds, and views to give them."""
+"""Sizes of networks that run in seconds, views to give them, and the published parameters of some."""
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 
+from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import (
     OFFICIAL,
     BackboneSizes,
@@ -11,6 +13,8 @@ from reli3d.nn.presets import (
     IlluminationSizes,
     UpsamplerSizes,
 )
+from reli3d.nn.reni import EnvironmentDecoder
+from reli3d.nn.weights import published_state, read_manifest, read_tensors
 
 TINY = replace(  # the sizes of the golden tiny_system
     OFFICIAL,
@@ -67,3 +71,27 @@ def views(objects, count, size, seed=0):
     images = torch.rand(objects, count, size, size, 3, generator=generator)
     masks = (torch.rand(objects, count, size, size, generator=generator) > 0.5).float()
     return images, masks, c2w.unflatten(-1, (4, 4)), intrinsics
+
+
+def published_reni(goldens) -> dict[str, torch.Tensor]:
+    """Parameters of the published RENI++ field."""
+    manifest = read_manifest(goldens.parent / "reni++L49.safetensors")
+    return read_tensors(manifest, {name: torch.float32 for name in manifest.tensors})
+
+
+def published_decoder(goldens) -> EnvironmentDecoder:
+    decoder = EnvironmentDecoder(OFFICIAL.reni)
+    decoder.field.load_state_dict(published_reni(goldens))
+    return decoder.eval()
+
+
+def golden_tiny(goldens) -> tuple[Reconstructor, dict[str, torch.Tensor]]:
+    """The system ``TINY`` with the golden's parameters, and the golden's values."""
+    with np.load(goldens / "tiny_system.npz") as file:
+        values = {k: torch.from_numpy(file[k]) for k in file.files}
+    model = Reconstructor(TINY).eval()
+    state = published_state({k[len("param.") :]: v for k, v in values.items() if k.startswith("param.")}, "golden")
+    state |= {"environment.field." + k: v for k, v in published_reni(goldens).items()}
+    state["environment.sample_directions"] = model.environment.sample_directions
+    model.load_state_dict(state, strict=True)
+    return model, values

@@ -34,6 +34,7 @@ from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.shading import ShadeOptions, shade
 from reli3d.render.silhouette import antialias
 from reli3d.render.volume import RaySamples, composite
+from tests.support.meshes import mesh_from
 from tests.support.surfaces import at, on_ball
 
 N = 5200  # rows: five slices of a CPU launch
@@ -84,11 +85,10 @@ def numbers(n: int) -> Tensor:
 
 
 def ball(device, subdivisions: int = 2, radius: float = 0.5) -> tuple[Tensor, Tensor]:
-    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
-    turned = mesh.vertices @ trimesh.transformations.euler_matrix(0.4, 0.7, 0.2)[:3, :3].T  # no ties with any axis
-    return torch.tensor(turned, dtype=torch.float32, device=device), torch.tensor(
-        mesh.faces, dtype=torch.int32, device=device
-    )
+    shape = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    # no ties with any axis
+    mesh = mesh_from(shape.apply_transform(trimesh.transformations.euler_matrix(0.4, 0.7, 0.2)), device)
+    return mesh.vertices, mesh.faces
 
 
 def corners(count: int) -> Tensor:
@@ -125,12 +125,7 @@ def reevaluate(vertices, origins, directions):
 
 
 def camera(device, size: int = 32) -> Camera:
-    at = torch.tensor([0.7, 0.9, 2.0], device=device, dtype=torch.float32)
-    pose = look_at(
-        at,
-        torch.zeros(3, device=device, dtype=torch.float32),
-        torch.tensor([0.0, 1.0, 0.0], device=device, dtype=torch.float32),
-    )
+    pose = look_at(torch.tensor([0.7, 0.9, 2.0], device=device, dtype=torch.float32))
     return Camera.from_fov(pose, 0.7, size, size)
 
 

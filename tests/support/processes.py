@@ -1,6 +1,7 @@
-"""Scripts in processes of their own, alone or as a group that trains together."""
+"""Scripts in processes of their own, alone or as a group that trains together, and their signals."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -20,3 +21,9 @@ def on_two(script, *arguments) -> None:
     ]
     errors = [process.communicate(timeout=300)[1] for process in started]
     assert [process.returncode for process in started] == [0, 0], errors
+
+
+def heed_signals() -> None:
+    """For ``preexec_fn``: the child ends by Ctrl-C and a closed terminal under nohup and in the background too."""
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)

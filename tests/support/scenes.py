@@ -1,5 +1,7 @@
 """Small scenes: an eye, balls with their textures, a mesh that casts a shadow, maps of light."""
 
+from dataclasses import replace
+
 import torch
 import trimesh
 
@@ -8,14 +10,14 @@ from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
+from tests.support.meshes import mesh_from
 
 SKIES = ("constant", "sky", "sun")
 
 
 def eye(device, *position):
     """Pose of a camera that looks at the origin."""
-    at = torch.tensor(position, dtype=torch.float32, device=device)
-    return look_at(at, torch.zeros(3, device=device), torch.tensor([0.0, 1.0, 0.0], device=device))
+    return look_at(torch.tensor(position, dtype=torch.float32, device=device))
 
 
 def textures(size, device, color=(0.5, 0.5, 0.5), roughness=0.5, metallic=0.0, normal=(0.5, 0.5, 1.0)):
@@ -26,34 +28,25 @@ def textures(size, device, color=(0.5, 0.5, 0.5), roughness=0.5, metallic=0.0, n
 
 def ball(device, color=(0.7, 0.7, 0.7)):
     """An asset of one finish; its texture coordinates are random."""
-    m = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
-    f = torch.tensor(m.faces, dtype=torch.int32, device=device)
-    v = torch.tensor(m.vertices, dtype=torch.float32, device=device)
-    uv = torch.rand(len(v), 2, generator=torch.Generator().manual_seed(0)).to(device)
-    return Asset(Mesh(v, f, torch.nn.functional.normalize(v, dim=-1), uv), textures(4, device, color))
+    mesh = mesh_from(trimesh.creation.icosphere(subdivisions=3, radius=0.6), device)
+    uv = torch.rand(len(mesh.vertices), 2, generator=torch.Generator().manual_seed(0)).to(device)
+    normals = torch.nn.functional.normalize(mesh.vertices, dim=-1)
+    return Asset(replace(mesh, normals=normals, uv=uv), textures(4, device, color))
 
 
 def ball_mesh(subdivisions: int, radius: float) -> Mesh:
     """A ball with smooth normals, tangents, and its view from +Z as texture coordinates."""
-    m = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
-    v = torch.tensor(m.vertices, dtype=torch.float32)
-    n = torch.nn.functional.normalize(v, dim=-1)
+    mesh = mesh_from(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius))
+    n = torch.nn.functional.normalize(mesh.vertices, dim=-1)
     tangent = torch.nn.functional.normalize(torch.linalg.cross(n.new_tensor([0.3, 0.5, 0.81]).expand_as(n), n), dim=-1)
-    return Mesh(
-        v,
-        torch.tensor(m.faces, dtype=torch.int32),
-        n,
-        (0.5 + 0.45 * n[:, :2]).contiguous(),
-        torch.cat([tangent, torch.ones(len(v), 1)], -1),
-    )
+    tangents = torch.nn.functional.pad(tangent, (0, 1), value=1.0)
+    return replace(mesh, normals=n, uv=(0.5 + 0.45 * n[:, :2]).contiguous(), tangents=tangents)
 
 
 def shadow_caster(device, backend="auto"):
     """A ball above the unit ball's points: it hides part of the sky."""
-    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.4)
-    mesh.apply_translation([0, 1.2, 0])
-    vertices, faces = torch.tensor(mesh.vertices).float().to(device), torch.tensor(mesh.faces).int().to(device)
-    return RayScene(vertices, faces, backend=backend)
+    shape = trimesh.creation.icosphere(subdivisions=3, radius=0.4).apply_translation([0, 1.2, 0])
+    return RayScene(mesh_from(shape, device), backend=backend)
 
 
 def sky(height=16, seed=0, power=3.0):

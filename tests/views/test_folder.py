@@ -72,33 +72,14 @@ def test_nerfstudio_folder(tmp_path):
         mask[4:20, 6:30] = 255
         (tmp_path / "masks").mkdir(exist_ok=True)
         Image.fromarray(mask).save(tmp_path / f"masks/{name}.png")
+    own = {"fl_x": 70.0, "w": 40, "h": 30, "cx": 19.0, "cy": 14.0}
     frames = [
         {"file_path": "images/a.jpg", "mask_path": "masks/a.png", "transform_matrix": hostile.pose(0.0)},
-        {
-            "file_path": "images/b.jpg",
-            "transform_matrix": hostile.pose(1.0),
-            "fl_x": 70.0,
-            "w": 40,
-            "h": 30,
-            "cx": 19.0,
-            "cy": 14.0,
-        },
+        {"file_path": "images/b.jpg", "transform_matrix": hostile.pose(1.0), **own},
     ]
-    top = dict(
-        camera_model="OPENCV",
-        fl_x=120.0,
-        fl_y=121.0,
-        cx=41.0,
-        cy=29.0,
-        w=80,
-        h=60,
-        k1=1e-4,
-        k2=0.0,
-        p1=0,
-        p2=0,
-        applied_transform=[[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]],
-    )
-    transforms(tmp_path, frames, **top)
+    top = dict(fl_x=120.0, fl_y=121.0, cx=41.0, cy=29.0, w=80, h=60, k1=1e-4, k2=0.0, p1=0, p2=0)
+    applied = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]
+    transforms(tmp_path, frames, camera_model="OPENCV", **top, applied_transform=applied)
     views = load_views(tmp_path)
     # the first is calibrated at twice the size; the second has its own focal length, which serves both sides
     torch.testing.assert_close(views.intrinsics, torch.tensor([[60.0, 60.5, 20.5, 14.5], [70.0, 70.0, 19.0, 14.0]]))
