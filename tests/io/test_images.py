@@ -1,6 +1,8 @@
 import math
 import os
+import struct
 import tracemalloc
+import zlib
 
 import numpy as np
 import OpenEXR
@@ -14,6 +16,10 @@ from reli3d.io.hdr import read_hdr_image
 from reli3d.io.images import color_of, png_bytes, read_image, write_image, write_png
 
 NOISE = np.random.default_rng(3).integers(0, 256, (9, 14, 4), np.uint8)
+SIZE = (40, 24)  # width, height
+SHADES = np.random.default_rng(1).integers(0, 256, (SIZE[1], SIZE[0], 4), np.uint8)
+DEEP = SHADES.astype(np.uint16) * 256 + 3
+PALETTE = Image.fromarray(SHADES[..., :3]).quantize(16)
 
 
 def saved(tmp_path, image: Image.Image, name: str, **options):
@@ -21,35 +27,90 @@ def saved(tmp_path, image: Image.Image, name: str, **options):
     return tmp_path / name
 
 
-@pytest.mark.parametrize("name, options", [("a.png", {}), ("a.webp", {"lossless": True, "exact": True}), ("a.tif", {})])
-def test_straight_alpha_and_the_color_under_it_are_kept(tmp_path, name, options):
-    rgb, alpha = read_image(saved(tmp_path, Image.fromarray(NOISE), name, **options))
-    # 8-bit values over 255 in float32: exact to one rounding
-    torch.testing.assert_close(rgb, torch.from_numpy(NOISE[..., :3] / 255).float(), rtol=0, atol=6e-8)
-    torch.testing.assert_close(alpha, torch.from_numpy(NOISE[..., 3] / 255).float(), rtol=0, atol=6e-8)
+def deep_png(path, values):
+    """16-bit PNG of ``(H, W, C)`` values; Pillow writes none but gray."""
+
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    height, width, channels = values.shape
+    kind = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
+    head = struct.pack(">IIBBBBB", width, height, 16, kind, 0, 0, 0)
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    )
 
 
-def test_gray_palette_and_cmyk_are_read_as_color(tmp_path):
-    gray, alpha = read_image(saved(tmp_path, Image.fromarray(NOISE[..., 0]), "gray.png"))
-    assert alpha is None
-    assert torch.equal((gray * 255).round().byte(), torch.from_numpy(NOISE[..., :1]).expand(-1, -1, 3))
-    flat = Image.fromarray(np.repeat(NOISE[:1, :5, :3], 7, 0))
-    palette, alpha = read_image(saved(tmp_path, flat.quantize(8), "palette.png"))
-    assert alpha is None
-    # 5 colors in 8 slots: the palette is exact up to the quantizer's averaging in 5-bit bins
-    assert float((palette * 255 - torch.from_numpy(np.array(flat)).float()).abs().max()) <= 8
-    indexed = flat.quantize(8)
-    _, alpha = read_image(saved(tmp_path, indexed, "key.png", transparency=indexed.getpixel((0, 0))))
+def saver(mode, ending, **options):
+    return lambda path: Image.fromarray(SHADES).convert(mode).save(path.with_suffix(ending), **options)
+
+
+def gray(k):
+    return lambda v: np.repeat(v[..., k : k + 1], 3, -1)
+
+
+# kind of image: how a file of it is written, expected color, tolerance [of 255]
+ACCEPTED = {
+    "8-bit color": (saver("RGB", ".png"), lambda v: v[..., :3], 0),
+    "8-bit color, TIFF": (saver("RGB", ".tif"), lambda v: v[..., :3], 0),
+    "8-bit color with alpha": (saver("RGBA", ".png"), lambda v: v[..., :3], 0),
+    "8-bit color with alpha, WebP": (saver("RGBA", ".webp", lossless=True, exact=True), lambda v: v[..., :3], 0),
+    "8-bit color with alpha, TIFF": (saver("RGBA", ".tif"), lambda v: v[..., :3], 0),
+    "8-bit gray": (lambda p: Image.fromarray(SHADES[..., 0]).save(p), gray(0), 0),
+    "1-bit": (lambda p: Image.fromarray(SHADES[..., 0] > 99).save(p), lambda v: (gray(0)(v) > 99) * 255, 0),
+    "16-bit gray": (lambda p: Image.fromarray(DEEP[..., 0]).save(p), lambda v: DEEP[..., :1] / 257.0, 0),
+    "16-bit color": (lambda p: deep_png(p, DEEP[..., :3]), lambda v: v[..., :3], 1),  # the low byte is dropped
+    "16-bit color with alpha": (lambda p: deep_png(p, DEEP), lambda v: v[..., :3], 1),
+    "palette": (lambda p: PALETTE.save(p), lambda v: np.array(PALETTE.convert("RGB")), 0),
+    # Pillow's plain conversion to ink and back: each of the two rounds to 8 bits
+    "CMYK": (
+        lambda p: Image.fromarray(SHADES[..., :3]).convert("CMYK").save(p.with_suffix(".tif")),
+        lambda v: v[..., :3],
+        2,
+    ),
+}
+REFUSED = {
+    "32-bit": lambda p: Image.fromarray(SHADES[..., 0].astype(np.float32)).save(p.with_suffix(".tif")),
+    "LAB": lambda p: Image.fromarray(SHADES[..., :3]).convert("RGB").save(p.with_suffix(".gif")),
+    "AVIF": lambda p: Image.fromarray(SHADES[..., :3]).save(p.with_suffix(".avif")),
+    "several frames": lambda p: Image.fromarray(SHADES).save(
+        p.with_suffix(".tif"), save_all=True, append_images=[Image.fromarray(SHADES)]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ACCEPTED)
+def test_accepted_images_are_read_as_stored(tmp_path, name):
+    write, expected, tolerance = ACCEPTED[name]
+    write(tmp_path / "a.png")
+    (path,) = tmp_path.iterdir()
+    color_of, alpha = read_image(path)
+    exact = torch.from_numpy(np.ascontiguousarray(expected(SHADES))).float().expand(SIZE[1], SIZE[0], 3)
+    assert float((color_of * 255 - exact).abs().max()) <= tolerance + 1e-4  # a few ulp of float32 at 255
+    assert (alpha is not None) == ("alpha" in name)
+    if alpha is not None:
+        assert torch.equal((alpha * 255).round().byte(), torch.from_numpy(SHADES[..., 3].copy()))
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refused_images_end_in_one_line(tmp_path, name):
+    REFUSED[name](tmp_path / "a.png")
+    (path,) = tmp_path.iterdir()
+    with pytest.raises(InputError, match=r"a\.\w+: expected .*; "):
+        read_image(path)
+
+
+def test_a_transparent_color_of_a_palette_is_alpha(tmp_path):
+    flat = Image.fromarray(np.repeat(NOISE[:1, :5, :3], 7, 0)).quantize(8)
+    _, alpha = read_image(saved(tmp_path, flat, "key.png", transparency=flat.getpixel((0, 0))))
     assert float(alpha[0, 0]) == 0.0
     assert float(alpha.max()) == 1.0
+
+
+def test_cmyk_jpeg_is_read_as_color(tmp_path):
     cmyk, _ = read_image(saved(tmp_path, Image.new("CMYK", (16, 16), (0, 255, 255, 0)), "ink.jpg", quality=95))
     assert (cmyk[8, 8] - torch.tensor([1.0, 0.0, 0.0])).abs().max() < 0.03  # JPEG of a flat color: a few 8-bit steps
-
-
-def test_16_bit_gray_keeps_its_precision(tmp_path):
-    ramp = np.arange(0, 65536, 257, dtype=np.uint16).reshape(16, 16) + 5
-    rgb, _ = read_image(saved(tmp_path, Image.fromarray(ramp), "deep.png"))
-    torch.testing.assert_close(rgb[..., 1], torch.from_numpy(ramp.astype(np.float32) / 65535), rtol=0, atol=6e-8)
 
 
 def test_exif_orientation_is_noted_and_not_applied(tmp_path):

@@ -2,36 +2,19 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 from reli3d.nn.heads import HEADS, deformation, truncated_exp
 from reli3d.nn.model import Reconstructor
-from reli3d.nn.presets import (
-    OFFICIAL,
-    SMALL,
-    from_json,
-    to_json,
-)
+from reli3d.nn.presets import OFFICIAL
 from reli3d.nn.reni import to_published
-from reli3d.nn.weights import published_state, read_manifest, read_tensors
-from tests.support.networks import NANO, TINY, views
+from tests.support.networks import NANO, golden_tiny, views
 
 
 @pytest.fixture
 def tiny(goldens):
-    """The tiny system with the golden's parameters, and the golden's values."""
-    with np.load(goldens / "tiny_system.npz") as file:
-        values = {k: torch.from_numpy(file[k]) for k in file.files}
-    model = Reconstructor(TINY).eval()
-    state = published_state({k[len("param.") :]: v for k, v in values.items() if k.startswith("param.")}, "golden")
-    published = read_manifest(goldens.parent / "reni++L49.safetensors")
-    reni = read_tensors(published, {name: torch.float32 for name in published.tensors})
-    state |= {"environment.field." + k: v for k, v in reni.items()}
-    state["environment.sample_directions"] = model.environment.sample_directions
-    model.load_state_dict(state, strict=True)
-    return model, values
+    return golden_tiny(goldens)
 
 
 @torch.no_grad()
@@ -165,14 +148,6 @@ def test_inputs_that_do_not_belong_together_are_named():
         model.encode(images[0], masks[0], c2w[0], intrinsics[0])
     with pytest.raises(TypeError, match="c2w: expected torch.float32, got torch.float64"):
         model.encode(images, masks, c2w.double(), intrinsics)
-
-
-def test_presets_return_from_their_text():
-    for preset in (SMALL, OFFICIAL, NANO):
-        assert from_json(to_json(preset)) == preset
-    for text in ("", "[]", "{}", '{"name": "x"}', to_json(SMALL).replace('"name": "small"', '"name": 5')):
-        with pytest.raises(ValueError, match="preset"):
-            from_json(text)
 
 
 @torch.no_grad()

@@ -26,7 +26,7 @@ LOCAL = dataclasses.replace(
 )
 HUGE = 1 << 40
 HOSTILE = [0, 1, 2, 3, 7, -1, HUGE, 8192, 0.5, math.nan, math.inf, True, None, "8", [], [8], [0, 8, 8], [7, 17, 9], {}]
-HOSTILE += [[8.0, 8, 8], [8] * 9, [8192, 8192, 8192], [1, 1, 1], [8, 8], [16, 24, 32]]
+HOSTILE += [[8.0, 8, 8], [HUGE] * 3, [8] * 9, [8192, 8192, 8192], [1, 1, 1], [8, 8], [16, 24, 32]]
 
 
 def paths(values: dict, at: tuple = ()):

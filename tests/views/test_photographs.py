@@ -13,91 +13,10 @@ from PIL import Image
 
 from reli3d.errors import InputError
 from reli3d.geometry.camera import project
-from reli3d.io.images import read_image
 from reli3d.views.folder import load_views
 from reli3d.views.reduce import MAX_FULL_PIXELS, MAX_OBJECT_PIXELS, cut
 from tests.support import hostile
 from tests.support.hostile import pose
-
-SIZE = (40, 24)  # width, height
-SHADES = np.random.default_rng(1).integers(0, 256, (SIZE[1], SIZE[0], 4), np.uint8)
-DEEP = SHADES.astype(np.uint16) * 256 + 3
-PALETTE = Image.fromarray(SHADES[..., :3]).quantize(16)
-
-
-def deep_png(path, values):
-    """16-bit PNG of ``(H, W, C)`` values; Pillow writes none but gray."""
-    import struct
-    import zlib
-
-    def chunk(name, data):
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-    height, width, channels = values.shape
-    kind = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
-    head = struct.pack(">IIBBBBB", width, height, 16, kind, 0, 0, 0)
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
-    )
-
-
-def saver(mode, ending, **options):
-    return lambda path: Image.fromarray(SHADES).convert(mode).save(path.with_suffix(ending), **options)
-
-
-def gray(k):
-    return lambda v: np.repeat(v[..., k : k + 1], 3, -1)
-
-
-# kind of image: how a file of it is written, expected color, tolerance [of 255]
-ACCEPTED = {
-    "8-bit color": (saver("RGB", ".png"), lambda v: v[..., :3], 0),
-    "8-bit color, TIFF": (saver("RGB", ".tif"), lambda v: v[..., :3], 0),
-    "8-bit color with alpha": (saver("RGBA", ".png"), lambda v: v[..., :3], 0),
-    "8-bit color with alpha, WebP": (saver("RGBA", ".webp", lossless=True, exact=True), lambda v: v[..., :3], 0),
-    "8-bit gray": (lambda p: Image.fromarray(SHADES[..., 0]).save(p), gray(0), 0),
-    "1-bit": (lambda p: Image.fromarray(SHADES[..., 0] > 99).save(p), lambda v: (gray(0)(v) > 99) * 255, 0),
-    "16-bit gray": (lambda p: Image.fromarray(DEEP[..., 0]).save(p), lambda v: DEEP[..., :1] / 257.0, 0),
-    "16-bit color": (lambda p: deep_png(p, DEEP[..., :3]), lambda v: v[..., :3], 1),  # the low byte is dropped
-    "16-bit color with alpha": (lambda p: deep_png(p, DEEP), lambda v: v[..., :3], 1),
-    "palette": (lambda p: PALETTE.save(p), lambda v: np.array(PALETTE.convert("RGB")), 0),
-    # Pillow's plain conversion to ink and back: each of the two rounds to 8 bits
-    "CMYK": (
-        lambda p: Image.fromarray(SHADES[..., :3]).convert("CMYK").save(p.with_suffix(".tif")),
-        lambda v: v[..., :3],
-        2,
-    ),
-}
-REFUSED = {
-    "32-bit": lambda p: Image.fromarray(SHADES[..., 0].astype(np.float32)).save(p.with_suffix(".tif")),
-    "LAB": lambda p: Image.fromarray(SHADES[..., :3]).convert("RGB").save(p.with_suffix(".gif")),
-    "AVIF": lambda p: Image.fromarray(SHADES[..., :3]).save(p.with_suffix(".avif")),
-    "several frames": lambda p: Image.fromarray(SHADES).save(
-        p.with_suffix(".tif"), save_all=True, append_images=[Image.fromarray(SHADES)]
-    ),
-}
-
-
-@pytest.mark.parametrize("name", ACCEPTED)
-def test_accepted_images_are_read_as_stored(tmp_path, name):
-    write, expected, tolerance = ACCEPTED[name]
-    write(tmp_path / "a.png")
-    (path,) = tmp_path.iterdir()
-    color_of, alpha = read_image(path)
-    exact = torch.from_numpy(np.ascontiguousarray(expected(SHADES))).float().expand(SIZE[1], SIZE[0], 3)
-    assert float((color_of * 255 - exact).abs().max()) <= tolerance + 1e-4  # a few ulp of float32 at 255
-    assert (alpha is not None) == ("alpha" in name)
-    if alpha is not None:
-        assert torch.equal((alpha * 255).round().byte(), torch.from_numpy(SHADES[..., 3].copy()))
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_refused_images_end_in_one_line(tmp_path, name):
-    REFUSED[name](tmp_path / "a.png")
-    (path,) = tmp_path.iterdir()
-    with pytest.raises(InputError, match=r"a\.\w+: expected .*; "):
-        read_image(path)
 
 
 def capture(folder, width, height, box, *, exif=None, mask_at=None, **lens):
