@@ -91,12 +91,6 @@ def test_all_terms_are_in_the_gradient(one):
     assert requested == set(vars(Weights()))
 
 
-def difference(f, value: torch.Tensor, direction: torch.Tensor, size: float) -> float:
-    with torch.no_grad():
-        ends = [float(f(value + sign * size * direction).double()) for sign in (1.0, -1.0)]
-    return (ends[0] - ends[1]) / (2.0 * size)
-
-
 def test_the_weight_of_quads_moves_their_centers(one, monkeypatch):
     """gamma decides the position of a quad's center.  Its last layer alone moves, by which no other weight changes."""
     model = ball_model()
@@ -110,11 +104,11 @@ def test_the_weight_of_quads_moves_their_centers(one, monkeypatch):
         vertices = surface(model, code, 16).mesh.vertices
         return (vertices * torch.randn(vertices.shape, generator=torch.Generator().manual_seed(1))).sum()
 
-    row, direction = weight[20].clone().requires_grad_(), torch.ones(weight.shape[1])
-    (gradient,) = torch.autograd.grad(centers(row), row)
+    row = weight[20].clone()
+    got, expected = slopes(lambda: centers(row), [row], [torch.ones(weight.shape[1])], 100.0)
     # float32 positions summed: 1e-6, of a difference of 2e-3; gamma is far from where its sigmoid bends
-    assert float(gradient @ direction) == pytest.approx(difference(centers, row.detach(), direction, 100.0), rel=0.02)
-    assert float(gradient @ direction) != 0.0
+    assert got == pytest.approx(expected, rel=0.02)
+    assert got != 0.0
 
 
 def test_the_normals_of_the_mesh_have_a_gradient_in_the_image(one):
@@ -126,7 +120,7 @@ def test_the_normals_of_the_mesh_have_a_gradient_in_the_image(one):
     with torch.no_grad():
         found = surface(model, code, 16)
     generator = torch.Generator().manual_seed(2)
-    normals, direction = found.mesh.normals, torch.randn(found.mesh.normals.shape, generator=generator)
+    normals, direction = found.mesh.normals.clone(), torch.randn(found.mesh.normals.shape, generator=generator)
 
     def lit(points, wo, scene):
         return 0.5 + 0.25 * points.normal
@@ -137,7 +131,6 @@ def test_the_normals_of_the_mesh_have_a_gradient_in_the_image(one):
         return (rendering.color * noise).sum() + (rendering.normal * noise.flip(0)).sum()
 
     noise = torch.randn(24, 24, 3, generator=generator)
-    leaf = normals.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(shown(leaf), leaf)
+    got, expected = slopes(lambda: shown(normals), [normals], [direction], 1e-2)
     # float32 sums of 576 pixels; the curvature of a normalization over a step of 1e-2 is 1e-4
-    assert float((gradient * direction).sum()) == pytest.approx(difference(shown, normals, direction, 1e-2), rel=0.01)
+    assert got == pytest.approx(expected, rel=0.01)
