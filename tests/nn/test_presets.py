@@ -99,6 +99,7 @@ def test_a_field_with_a_hostile_value_makes_a_network_or_is_named(preset, path):
         (NANO, ("reni", "height"), 8192, r"preset.reni.height: expected an integer from 4 to 512, got 8192"),
         (NANO, ("backbone", "blocks"), 0, r"preset.backbone.blocks: expected an integer from 1 to 64, got 0"),
         (NANO, ("radius",), math.nan, r"preset.radius: expected a number from 0.001 to 1000, got nan"),
+        (NANO, ("radius",), math.inf, r"preset.radius: expected a number from 0.001 to 1000, got inf"),
         (NANO, ("tone_mapping",), True, r"preset.tone_mapping: not a field of this version; convert .* again"),
         (LOCAL, ("image_size",), 36, r"preset.image_size: expected a multiple of 8, as there are levels .*, got 36"),
     ],
