@@ -279,9 +279,9 @@ class ReconstructOptions:
 
     texture_size: texels per side, 256 to 4096.  resolution: cubes per side of the FlexiCubes grid, 16 to 256; None: the
     preset's value.  normalization: how the object is placed in the network's cube.  ``hull``: the bounding box of the
-    visual hull is centered and its longest side scaled to 1.  ``none``: poses as stored.  ``auto``: like ``hull``, with
-    ``views.object_box`` as the box, if it is set; otherwise poses as stored if the visual hull lies in the cube, near
-    its center and not much smaller (:func:`~reli3d.views.normalize.normalize`); otherwise ``hull``.  A
+    visual hull is centered and its longest side scaled to 1.  ``none``: poses as stored.  ``auto``: if
+    ``views.object_box`` is set, like ``hull`` with that box; else poses as stored if the visual hull lies in the cube,
+    near its center and not much smaller (:func:`~reli3d.views.normalize.normalize`); else ``hull``.  A
     :class:`~reli3d.views.similarity.Similarity`: the transform from the input to the model frame.  None, the default:
     ``auto`` for the bundled network, ``none`` for the published network.  up: axis of the cameras' world frame that
     becomes +Y: ``x``, ``y`` or ``z``, optionally with a minus sign.  uv: unwrapping method, ``project`` or ``xatlas``.
@@ -411,7 +411,7 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
     """Refines mesh, maps and lighting of ``asset`` by inverse rendering of ``views``.
 
-    To judge the fit, some views are held out: none of 1 or 2, one of 3 to 11, two of 12 or more.  On the fitted
+    To judge the fit, views are held out: one if there are 3 to 11, two if 12 or more.  On the fitted
     surface, material (base color, roughness, metallic, shading normals) and lighting are each blended between their
     initial (weight 0) and fitted (weight 1) values, with weight 1, 1/2 or 0.  Weights are tried in a fixed order, from
     the complete fit to the fitted surface alone.  The result is the first blend whose mean PSNR over the fitted, the

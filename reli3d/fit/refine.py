@@ -101,15 +101,15 @@ def refine(
     automatically for thin objects (:func:`~reli3d.fit.shape.start_grid`).  weights: loss weights; None: the defaults.
     cameras: optimize the camera poses as well.  light: ``object``: the lighting is fixed to the object; ``camera``: it
     is fixed to the camera, as on a turntable or with a flash; a sequence of labels, one per view: views with equal
-    labels share their lighting.  Except for ``object``, the result has the lighting of view 0.  seed: random seed.
+    labels share their lighting.  Unless ``object``, the result has the lighting of view 0.  seed: random seed.
     bar: show progress on stderr.  interrupt: called before every step; once it returns True the fit ends with the best
     result so far.
 
-    With three or more views some are held out (:func:`held_out`): their masks are used, their colors only to select
-    which parts of the fit are kept (:func:`~reli3d.fit.choice.chosen`).  The inputs are detached: no gradient reaches
-    them, and the result has none.  Raises TypeError or ValueError if asset and views have different devices, if shapes
-    do not match, for an invalid ``light``, for a budget that is not one positive number, or if the asset lacks an
-    environment, an atlas or faces.
+    With three or more views some are held out (:func:`held_out`): the fit uses their masks; their colors only select
+    which parts of it are kept (:func:`~reli3d.fit.choice.chosen`).  The inputs are detached: no gradient reaches them,
+    and the result has none.  Raises TypeError or ValueError if asset and views have different devices, if shapes do not
+    match, for an invalid ``light``, for a budget that is not one positive number, or if the asset lacks an environment,
+    an atlas or faces.
     """
     images, weights = InputImages.of(views, light), weights or losses.Weights()
     _check_asset(asset, images)

@@ -1,6 +1,6 @@
 """Ray casting against a triangle mesh: closest hits and occlusion, by Embree (CPU) or Warp's BVH (CPU and CUDA).
 
-Directions may have any length, the unit of ``t``, which ranges from 0 (inclusive) to ``t_max`` (exclusive).  A ray
+Directions may have any length; it is the unit of ``t``, from 0 (inclusive) to ``t_max`` (exclusive).  A ray
 misses if it hits nothing, if it contains a NaN, an infinity or a zero direction, or if ``t`` exceeds the range of
 float32.  A miss has ``face = -1``, ``t = inf``, ``bary = 0``.  Only :meth:`RayScene.intersect` has gradients.
 """
