@@ -9,7 +9,7 @@ from reli3d.capture.fusion import fused_masks
 from reli3d.capture.mapping import Map, View
 from reli3d.capture.photos import Photo
 from reli3d.capture.scene import Plane, Scene
-from tests.capture.test_rigidity import view
+from tests.support.mapped import view
 
 RADIUS, GRAY = 0.35, 90.0
 
