@@ -25,7 +25,7 @@ def square(device, n, backward):
     x = torch.linspace(0, 1, n, device=device).requires_grad_(backward)
 
     def step():
-        (y,) = _bridge.call(square_kernel, n, [(x, wp.float32)], [((n,), wp.float32)], device=x.device)
+        (y,) = _bridge.call(square_kernel, n, [x], [(n,)])
         return torch.autograd.grad(y.sum(), x) if backward else y
 
     return step, {"numbers": n}

@@ -16,7 +16,7 @@ import os
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import cache, lru_cache
 from types import ModuleType
 from typing import TypeVar, cast
 
@@ -156,13 +156,18 @@ def array_of(tensor: Tensor, dtype) -> wp.array:
     return cast(wp.array, wp.from_torch(tensor, dtype=dtype, requires_grad=False))
 
 
-def views(args: Sequence) -> list:
-    """``args`` of :func:`launch` converted for Warp, for several launches; the caller keeps the tensors alive."""
-    return [view(*a) if isinstance(a, tuple) else a for a in args]
+@cache
+def _element_types(kernel) -> list:
+    """Element types of the array arguments of ``kernel`` after ``start``, in order; of other arguments any value."""
+    return [getattr(argument.type, "dtype", None) for argument in kernel.adj.args[1:]]
+
+
+def _views(args: Sequence, types: Sequence) -> list:
+    return [view(a, dtype) if isinstance(a, Tensor) else a for a, dtype in zip(args, types, strict=True)]
 
 
 def struct_of(kind, **fields):
-    """Warp struct ``kind`` with ``(tensor, warp type)`` pairs or plain values as fields; it keeps the tensors alive.
+    """Warp struct ``kind`` with tensors or plain values as fields; it keeps the tensors alive.
 
     Tensors must be contiguous and have no gradient: inputs that :func:`call` differentiates are separate arguments.
     """
@@ -170,15 +175,15 @@ def struct_of(kind, **fields):
     made = kind()
     native = made.__ctype__()  # Warp's own setters require arrays, which take twice as long to create
     for name, value in fields.items():
-        setattr(native, name, view(*value) if isinstance(value, tuple) else value)
-    vars(made)["tensors"] = [v[0] for v in fields.values() if isinstance(v, tuple)]  # keeps their memory alive
+        setattr(native, name, view(value, kind.vars[name].type.dtype) if isinstance(value, Tensor) else value)
+    vars(made)["tensors"] = [v for v in fields.values() if isinstance(v, Tensor)]  # keeps their memory alive
     return made
 
 
 def _check_device(args: Iterable, device: torch.device) -> None:
     """Raises ValueError for a tensor that is not on ``device``."""
     for value in args:
-        for tensor in (value[0],) if isinstance(value, tuple) else getattr(value, "tensors", ()):
+        for tensor in (value,) if isinstance(value, Tensor) else getattr(value, "tensors", ()):
             if tensor.device != device:
                 raise ValueError(f"tensor {tuple(tensor.shape)}: expected device {device}, got {tensor.device}")
 
@@ -213,14 +218,14 @@ def _load(kernel) -> None:
 def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: int = SLICE_MIN) -> None:
     """Launches ``kernel(start, *args)`` over ``n`` threads, without gradient.
 
-    args: ``(tensor, warp type)`` pairs or plain values; tensors contiguous, on ``device``, not copied.  slice_min:
-    least number of threads per CPU slice, small for kernels with much work per thread.
+    args: contiguous tensors on ``device``, not copied; views of them (:func:`view`); plain values.
+    slice_min: least number of threads per CPU slice, small for kernels with much work per thread.
     """
     if n == 0:
         return
     _check_device(args, device)
     with stream(device) as name:
-        values = views(args)
+        values = _views(args, _element_types(kernel))
         if name != "cpu":
             wp.launch(kernel, n, [0, *values], device=name)
             return
@@ -270,26 +275,22 @@ class _KernelOp(torch.autograd.Function):
     """``outs = kernel(start, *ins)``; backward launches the adjoint of the same kernel."""
 
     @staticmethod
-    def forward(ctx, kernel, n, slice_min, plain, types, shared, outs, device, *tensors):
-        results = [empty(shape, dtype, device) for shape, dtype in outs]
-        launch(
-            kernel,
-            n,
-            _fill(plain, zip(tensors, types, strict=True)) + _typed(results, outs),
-            device,
-            slice_min=slice_min,
-        )
+    def forward(ctx, kernel, n, slice_min, ins, shared, shapes, *tensors):
+        types, device = _element_types(kernel), tensors[0].device
+        results = [empty(shape, dtype, device) for shape, dtype in zip(shapes, types[len(ins) :], strict=True)]
+        launch(kernel, n, [*_filled(ins, tensors), *results], device, slice_min=slice_min)
         ctx.save_for_backward(*tensors, *results)
-        ctx.op = kernel, n, slice_min, plain, types, shared, outs, device
+        ctx.op = kernel, n, slice_min, ins, shared
         ctx.mark_non_differentiable(*(r for r in results if not r.is_floating_point()))
         return tuple(results)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *g_outs):
-        kernel, n, slice_min, plain, types, shared, outs, device = ctx.op
-        tensors, results = ctx.saved_tensors[: len(types)], ctx.saved_tensors[len(types) :]
-        needed = ctx.needs_input_grad[8:]
+        kernel, n, slice_min, ins, shared = ctx.op
+        slots = [i for i, value in enumerate(ins) if value is _SLOT]
+        tensors, results = ctx.saved_tensors[: len(slots)], ctx.saved_tensors[len(slots) :]
+        types, device, needed = _element_types(kernel), tensors[0].device, ctx.needs_input_grad[6:]
         parts = slices(n, slice_min) if device.type == "cpu" else [(0, n)]
         grads = [
             torch.zeros((len(parts) if i in shared else 1, *t.shape), dtype=t.dtype, device=device) if w else None
@@ -300,20 +301,18 @@ class _KernelOp(torch.autograd.Function):
             torch.zeros_like(r) if g is None and r.is_floating_point() else g
             for g, r in zip(g_results, results, strict=True)
         ]
-        ins = _fill(plain, zip(tensors, types, strict=True))
         if n > 0:
             with stream(device) as name:
-                _check_device([*ins, *((g,) for g in g_results if g is not None)], device)
-                values, out_values = views(ins), views(_typed(results, outs))
-                adj_out = [None if g is None else view(g, d) for g, (_, d) in zip(g_results, outs, strict=True)]
+                values = _filled(ins, tensors)
+                _check_device([*values, *g_results], device)
+                values, out_values = _views(values, types[: len(ins)]), _views(results, types[len(ins) :])
+                adj_out = _views(g_results, types[len(ins) :])
 
                 def adjoint(k, start, count):
-                    in_grads = [
-                        None if g is None else (g[min(k, g.shape[0] - 1)], d) for g, d in zip(grads, types, strict=True)
-                    ]
-                    in_grads = _fill([None] * len(plain), in_grads, plain)
-                    adj_in = [view(*a) if isinstance(a, tuple) else None for a in in_grads]
-                    wp.launch(kernel, count, [start, *values], out_values, adj_inputs=[None, *adj_in],
+                    adj_in: list = [None] * (1 + len(ins))
+                    for i, g in zip(slots, grads, strict=True):
+                        adj_in[1 + i] = None if g is None else view(g[min(k, g.shape[0] - 1)], types[i])
+                    wp.launch(kernel, count, [start, *values], out_values, adj_inputs=adj_in,
                               adj_outputs=adj_out, adjoint=True, device=name)  # fmt: skip
 
                 if name == "cpu":
@@ -321,33 +320,30 @@ class _KernelOp(torch.autograd.Function):
                     over_slices(n, adjoint, slice_min=slice_min)
                 else:
                     adjoint(0, 0, n)
-        return None, None, None, None, None, None, None, None, *(None if g is None else g.sum(0) for g in grads)
+        return *[None] * 6, *(None if g is None else g.sum(0) for g in grads)
 
 
-_SLOT = object()  # placeholder of a tensor among the plain arguments
+_SLOT = object()  # placeholder of a tensor among the arguments
 
 
-def _fill(plain, items, pattern=None):
-    items = iter(items)
-    return [next(items) if p is _SLOT else q for p, q in zip(pattern or plain, plain, strict=True)]
+def _filled(ins: Sequence, tensors: Sequence[Tensor]) -> list:
+    rest = iter(tensors)
+    return [next(rest) if value is _SLOT else value for value in ins]
 
 
-def _typed(tensors, outs):
-    return [(t, dtype) for t, (_, dtype) in zip(tensors, outs, strict=True)]
+def call(
+    kernel, n: int, ins: Sequence, shapes: Sequence[tuple[int, ...]], *, shared: Sequence[int] = (),
+    slice_min: int = SLICE_MIN,
+):  # fmt: skip
+    """Differentiable launch: new tensors from ``kernel(start, *ins, *outs)``, with arrays of these ``shapes`` as outs.
 
-
-def call(kernel, n: int, ins: Sequence, outs: Sequence, *, device: torch.device, shared: Sequence[int] = (),
-         slice_min: int = SLICE_MIN):  # fmt: skip
-    """Differentiable launch: new tensors ``outs = [(shape, warp type), ...]`` from ``kernel(start, *ins, *outs)``.
-
-    ins: ``(tensor, warp type)`` pairs or plain values.  Gradients reach every floating-point tensor of ``ins`` that
-    requires one, by the kernel's adjoint (its module needs ``enable_backward``).  shared: indices, among the tensors of
-    ``ins``, of those that more than one thread reads.  slice_min: as for :func:`launch`.
+    ins: tensors on one device, at least one, or plain values.  Gradients reach every floating-point tensor of ``ins``
+    that requires one, by the kernel's adjoint (its module needs ``enable_backward``).  shared: indices, among the
+    tensors of ``ins``, of those that more than one thread reads.  slice_min: as for :func:`launch`.
     """
-    tensors = [a[0].contiguous() for a in ins if isinstance(a, tuple)]
-    types = [a[1] for a in ins if isinstance(a, tuple)]
-    plain = [_SLOT if isinstance(a, tuple) else a for a in ins]
-    return _KernelOp.apply(kernel, n, slice_min, plain, types, frozenset(shared), list(outs), device, *tensors)
+    tensors = [a.contiguous() for a in ins if isinstance(a, Tensor)]
+    plain = [_SLOT if isinstance(a, Tensor) else a for a in ins]
+    return _KernelOp.apply(kernel, n, slice_min, plain, frozenset(shared), shapes, *tensors)
 
 
 def tensor_of(value, dtype: torch.dtype = torch.float32):

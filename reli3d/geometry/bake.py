@@ -12,7 +12,6 @@ from typing import overload
 
 import numpy as np
 import torch
-import warp as wp
 from torch import Tensor
 
 from reli3d import _bridge
@@ -75,9 +74,8 @@ def _bins(lower: Tensor, upper: Tensor, size: int, tile: int) -> tuple[Tensor, T
 
 def _tiles(corners: Tensor, lower: Tensor, upper: Tensor, size: int, tile: int) -> kernels.Tiles:
     """Kernel struct of faces ``corners (F, 3, 2)``, whose boxes are ``lower`` to ``upper``."""
-    start, faces = ((t, wp.int32) for t in _bins(lower, upper, size, tile))
-    corner = corners, wp.vec2
-    return struct_of(kernels.Tiles, corners=corner, face_start=start, face_list=faces, size=size, tile=tile)
+    start, faces = _bins(lower, upper, size, tile)
+    return struct_of(kernels.Tiles, corners=corners, face_start=start, face_list=faces, size=size, tile=tile)
 
 
 def _border_segments(faces: Tensor) -> Tensor:
@@ -108,11 +106,10 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     ends = torch.stack([corners.reshape(-1, 2), corners.roll(-1, 1).reshape(-1, 2)], 1)[segments.long()]
     lower, upper = torch.aminmax(ends, dim=1)
     segment_start, segment_list = _bins(lower - BORDER_TEXELS, upper + BORDER_TEXELS, size, tile)
-    borders = [(t, wp.int32) for t in (segment_start, segment_list, segments)]
     _bridge.launch(
         kernels.texels_kernel,
         (-(-size // tile)) ** 2,
-        [tiles, *borders, BORDER_TEXELS, (distance, wp.float32), (face, wp.int32), (bary, wp.vec2)],
+        [tiles, segment_start, segment_list, segments, BORDER_TEXELS, distance, face, bary],
         device,
         slice_min=TILES_MIN,
     )
@@ -128,11 +125,7 @@ def coverage(mesh: Mesh, size: int) -> Tensor:
         lower, upper = torch.aminmax(corners, dim=1)
         tiles = _tiles(corners, lower, upper, size, tile)
         _bridge.launch(
-            kernels.coverage_kernel,
-            (-(-size // tile)) ** 2,
-            [tiles, (hits, wp.uint8)],
-            corners.device,
-            slice_min=TILES_MIN,
+            kernels.coverage_kernel, (-(-size // tile)) ** 2, [tiles, hits], corners.device, slice_min=TILES_MIN
         )
     return hits
 
@@ -156,17 +149,15 @@ def _checked_places(mesh: Mesh, texels: Texels, index: Tensor) -> kernels.Places
 
 def _places(mesh: Mesh, texels: Texels, index: Tensor) -> kernels.Places:
     """Kernel struct of the texels of ``index``."""
-    face, bary = (texels.face.reshape(-1), wp.int32), (texels.bary.reshape(-1, 2), wp.vec2)
-    faces = mesh.faces.contiguous(), wp.int32
-    return struct_of(kernels.Places, texel=(index, wp.int64), face=face, bary=bary, faces=faces)
+    face, bary = texels.face.reshape(-1), texels.bary.reshape(-1, 2)
+    return struct_of(kernels.Places, texel=index, face=face, bary=bary, faces=mesh.faces.contiguous())
 
 
 def _positions_normals(mesh: Mesh, places: kernels.Places, index: Tensor) -> tuple[Tensor, Tensor]:
     normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
     position, normal = (torch.empty(len(index), 3, device=index.device, dtype=torch.float32) for _ in range(2))
-    sources = [(v.detach().contiguous(), wp.vec3) for v in (mesh.vertices, normals)]
-    inputs = [places, *sources, (position, wp.vec3), (normal, wp.vec3)]
-    _bridge.launch(kernels.attributes_kernel, len(index), inputs, index.device)
+    sources = [v.detach().contiguous() for v in (mesh.vertices, normals)]
+    _bridge.launch(kernels.attributes_kernel, len(index), [places, *sources, position, normal], index.device)
     return position, normal
 
 
@@ -174,7 +165,7 @@ def _tangents(mesh: Mesh, places: kernels.Places, index: Tensor) -> Tensor:
     if mesh.tangents is None:
         raise ValueError("mesh.tangents: expected tangents, got None (see Mesh.with_tangents)")
     tangent = torch.empty(len(index), 4, device=index.device, dtype=torch.float32)
-    inputs = [places, (mesh.tangents.detach().contiguous(), wp.vec4), (tangent, wp.vec4)]
+    inputs = [places, mesh.tangents.detach().contiguous(), tangent]
     _bridge.launch(kernels.tangents_kernel, len(index), inputs, index.device)
     return tangent
 
@@ -184,8 +175,7 @@ def _values(mesh: Mesh, values: Tensor, places: kernels.Places, index: Tensor) -
     if values.ndim != 2 or len(values) != len(mesh.vertices):
         raise ValueError(f"values: expected ({len(mesh.vertices)}, C), got {tuple(values.shape)}")
     out = torch.empty(len(index), values.shape[1], device=index.device, dtype=torch.float32)
-    inputs = [places, (values.detach().contiguous(), wp.float32), (out, wp.float32)]
-    _bridge.launch(kernels.values_kernel, len(index), inputs, index.device)
+    _bridge.launch(kernels.values_kernel, len(index), [places, values.detach().contiguous(), out], index.device)
     return out
 
 
@@ -265,19 +255,9 @@ def nearest_valid(valid: Tensor) -> tuple[Tensor, Tensor]:
         return source, square
     strips = -(-w // STRIP)
     _bridge.launch(
-        kernels.nearest_row_kernel,
-        strips,
-        [(valid.contiguous().view(torch.uint8), wp.uint8), STRIP, (row, wp.int32)],
-        device,
-        slice_min=1,
+        kernels.nearest_row_kernel, strips, [valid.contiguous().view(torch.uint8), STRIP, row], device, slice_min=1
     )
-    _bridge.launch(
-        kernels.nearest_texel_kernel,
-        h,
-        [(row, wp.int32), (site, wp.int32), (border, wp.float32), (source, wp.int32), (square, wp.float32)],
-        device,
-        slice_min=ROWS_MIN,
-    )
+    _bridge.launch(kernels.nearest_texel_kernel, h, [row, site, border, source, square], device, slice_min=ROWS_MIN)
     return source, square
 
 
@@ -314,6 +294,6 @@ def dilate(
 
 def _fill(value: Tensor, source: Tensor, square: Tensor, limit: float = float("inf")) -> None:
     """Copy texels of ``value (H, W, C)``, in place, from those that :func:`nearest_valid` found within ``limit``."""
-    nearest = (source.reshape(-1), wp.int32), (square.reshape(-1), wp.float32)
+    nearest = source.reshape(-1), square.reshape(-1)
     flat = value.view(-1, value.shape[2])
-    _bridge.launch(kernels.fill_kernel, len(flat), [*nearest, limit, flat.shape[1], (flat, wp.float32)], value.device)
+    _bridge.launch(kernels.fill_kernel, len(flat), [*nearest, limit, flat.shape[1], flat], value.device)

@@ -68,12 +68,12 @@ def border_edges(chart: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
     return (neighbors < 0) | (chart[neighbors] != chart[:, None])
 
 
-def _ints(values: np.ndarray):
-    return torch.from_numpy(np.ascontiguousarray(values, np.int32)), wp.int32
+def _ints(values: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, np.int32))
 
 
-def _floats(values: np.ndarray, kind):
-    return torch.from_numpy(np.ascontiguousarray(values, np.float32)), kind
+def _floats(values: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32))
 
 
 def axis_labels(normal: torch.Tensor, neighbors: np.ndarray) -> np.ndarray:
@@ -82,24 +82,12 @@ def axis_labels(normal: torch.Tensor, neighbors: np.ndarray) -> np.ndarray:
     smoothed = normal
     for _ in range(NORMAL_ROUNDS):
         rough, smoothed = smoothed, torch.empty_like(normal)
-        _bridge.launch(kernels.smooth_kernel, n, [links, (rough, wp.vec3), (smoothed, wp.vec3)], CPU, slice_min=LIGHT)
+        _bridge.launch(kernels.smooth_kernel, n, [links, rough, smoothed], CPU, slice_min=LIGHT)
     label = torch.empty(n, dtype=torch.int32, device="cpu")
-    _bridge.launch(
-        kernels.labels_kernel,
-        n,
-        [(normal, wp.vec3), (smoothed, wp.vec3), COS_LABEL, (label, wp.int32)],
-        CPU,
-        slice_min=LIGHT,
-    )
+    _bridge.launch(kernels.labels_kernel, n, [normal, smoothed, COS_LABEL, label], CPU, slice_min=LIGHT)
     for _ in range(MAJORITY_ROUNDS):
         voted = torch.empty_like(label)
-        _bridge.launch(
-            kernels.majority_kernel,
-            n,
-            [links, (normal, wp.vec3), (label, wp.int32), COS_LABEL, (voted, wp.int32)],
-            CPU,
-            slice_min=LIGHT,
-        )
+        _bridge.launch(kernels.majority_kernel, n, [links, normal, label, COS_LABEL, voted], CPU, slice_min=LIGHT)
         label = voted
     return label.numpy()
 
@@ -140,7 +128,7 @@ def _frames(normal: torch.Tensor, label: np.ndarray, chart: np.ndarray, count: i
     _bridge.launch(
         kernels.oblique_kernel,
         len(chart),
-        [(normal, wp.vec3), _ints(chart), _floats(toward, wp.vec3), COS_TILT, (oblique, wp.uint8)],
+        [normal, _ints(chart), _floats(toward), COS_TILT, oblique],
         CPU,
         slice_min=LIGHT,
     )
@@ -188,10 +176,8 @@ def cuts(along: np.ndarray, begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     int32, where those of a chart begin.
     """
     at, area = torch.empty(2, len(begin) - 1, CUT_ANGLES, 2, dtype=torch.float64, device="cpu")
-    ins = (torch.from_numpy(along), kernels.vec8d), (torch.from_numpy(begin), wp.int32)
-    _bridge.launch(
-        kernels.cuts_kernel, area.numel(), [*ins, (at, wp.float64), (area, wp.float64)], CPU, slice_min=CUT_ANGLES
-    )
+    ins = torch.from_numpy(along), torch.from_numpy(begin)
+    _bridge.launch(kernels.cuts_kernel, area.numel(), [*ins, at, area], CPU, slice_min=CUT_ANGLES)
     return at.numpy(), area.numpy()
 
 
@@ -268,11 +254,11 @@ def _overlaps(charts: Charts, boxes: np.ndarray, query: np.ndarray):
     bvh = wp.Bvh(_bridge.array_of(lower, wp.vec3), _bridge.array_of(upper, wp.vec3))
     count = torch.zeros(len(query), dtype=torch.int32, device="cpu")
     none = torch.zeros(1, dtype=torch.int64, device="cpu"), torch.zeros(1, dtype=torch.int32, device="cpu")
-    ins = _ints(boxes), _ints(query), (corners, wp.vec2)
+    ins = _ints(boxes), _ints(query), corners
 
     def find(emit: int = 0, offset: torch.Tensor = none[0], partner: torch.Tensor = none[1]) -> torch.Tensor:
         _bridge.launch(kernels.overlaps_kernel, len(query), [bvh.id, *ins, _ints(charts.chart), OVERLAP_TEXELS,
-                       (offset, wp.int64), emit, (count, wp.int32), (partner, wp.int32)], CPU)  # fmt: skip
+                       offset, emit, count, partner], CPU)  # fmt: skip
         return count
 
     return find
@@ -315,8 +301,8 @@ def split_overlaps(charts: Charts) -> bool:
     owner = torch.full((len(members),), -1, dtype=torch.int32, device="cpu")
     queue = torch.empty(3 * len(members) + 1, dtype=torch.int32, device="cpu")
     _bridge.launch(kernels.split_serial_kernel, 1, [
-        _ints(near), _ints(charts.chart[members]), _ints(seeds), (offset, wp.int64), (count, wp.int32),
-        _ints(rank[partner.numpy()]), charts.count, (queue, wp.int32), (owner, wp.int32)], CPU)  # fmt: skip
+        _ints(near), _ints(charts.chart[members]), _ints(seeds), offset, count,
+        _ints(rank[partner.numpy()]), charts.count, queue, owner], CPU)  # fmt: skip
     charts.chart[members] = owner.numpy()
     used, number = np.unique(charts.chart, return_inverse=True)
     spare = int(used[0] < 0)
@@ -338,13 +324,7 @@ def make_charts(
     reach = np.abs(points - center).max() or 1.0
     local = ((points - center) / reach).astype(np.float32)  # at most 1: products cannot overflow
     normal = torch.empty(len(faces), 3, dtype=torch.float32, device="cpu")
-    _bridge.launch(
-        kernels.normals_kernel,
-        len(faces),
-        [_floats(local, wp.vec3), _ints(faces), (normal, wp.vec3)],
-        CPU,
-        slice_min=LIGHT,
-    )
+    _bridge.launch(kernels.normals_kernel, len(faces), [_floats(local), _ints(faces), normal], CPU, slice_min=LIGHT)
     size = 0.5 * np.sqrt(np.einsum("fk,fk->f", normal.numpy(), normal.numpy(), dtype=np.float64))
     area = float(size.sum())
     unit = np.sqrt(texels / area) if area > 1e-30 else 0.0
@@ -371,8 +351,8 @@ def make_charts(
         torch.empty(len(faces), dtype=torch.uint8, device="cpu"),
     )
     _bridge.launch(kernels.project_kernel, len(faces), [
-        _floats(local, wp.vec3), _ints(faces), _ints(chart), _floats(right, wp.vec3), _floats(up, wp.vec3),
-        _floats(low, wp.vec2), sliver, (corners, wp.vec2), (flat, wp.uint8)], CPU, slice_min=LIGHT)  # fmt: skip
+        _floats(local), _ints(faces), _ints(chart), _floats(right), _floats(up),
+        _floats(low), sliver, corners, flat], CPU, slice_min=LIGHT)  # fmt: skip
     charts = Charts(np.where(flat.numpy() > 0, -1, chart).astype(np.int32), corners.numpy(), neighbors, count)
     split_overlaps(charts)
     return charts

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-import warp as wp
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -46,20 +45,11 @@ def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Came
     sdf, bound, distance = (v.detach().contiguous() for v in (sdf, bound, distance))
     lowest = _lowest(sdf)
     residual = sdf.new_empty(views, height // STRIDE, width // STRIDE)
-    posed = (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4)
-    cameras = [(v.detach().contiguous(), kind) for v, kind in posed]
+    cameras = [v.detach().contiguous() for v in (camera.c2w, camera.intrinsics)]
     launch(
         kernels.residual_kernel,
         residual.numel(),
-        [
-            *((v, wp.float32) for v in (sdf, lowest, distance)),
-            *cameras,
-            radius,
-            DEPTH,
-            FIELD_MAX,
-            STRIDE,
-            (residual, wp.float32),
-        ],
+        [sdf, lowest, distance, *cameras, radius, DEPTH, FIELD_MAX, STRIDE, residual],
         sdf.device,
     )
     residual = max_pool2d(residual, 3, 1, 1)  # dilated by a ray, so that interpolation reaches the silhouette's edge
@@ -67,16 +57,7 @@ def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Came
     launch(
         kernels.lower_kernel,
         sdf.numel(),
-        [
-            (sdf, wp.float32),
-            (bound, wp.float32),
-            (residual, wp.float32),
-            *cameras,
-            radius,
-            FIELD_MAX,
-            STRIDE,
-            (lowered, wp.float32),
-        ],
+        [sdf, bound, residual, *cameras, radius, FIELD_MAX, STRIDE, lowered],
         sdf.device,
     )
     return lowered

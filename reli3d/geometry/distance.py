@@ -38,10 +38,5 @@ def signed_distance(vertices: Tensor, faces: Tensor, points: Tensor) -> Tensor:
         )
     safe = torch.where(finite[:, None], points, torch.zeros_like(points))
     reach = 4.0 * float(torch.cat([vertices, safe]).abs().max()) + 1.0  # longer than any distance that can occur
-    _bridge.launch(
-        kernels.signed_distance_kernel,
-        len(points),
-        [mesh.id, (safe, wp.vec3), reach, (distance, wp.float32)],
-        points.device,
-    )
+    _bridge.launch(kernels.signed_distance_kernel, len(points), [mesh.id, safe, reach, distance], points.device)
     return torch.where(finite, distance, torch.full_like(distance, float("nan")))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import call, check, launch, once_differentiable
@@ -24,8 +23,7 @@ def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
     if grid.ndim != 4 or min(grid.shape[:3]) < 2:
         raise ValueError(f"grid: expected (X, Y, Z, C) of at least 2 points along each axis, got {tuple(grid.shape)}")
     n = len(points)
-    outs = [((n, grid.shape[3]), wp.float32)]
-    (out,) = call(sample_grid_kernel, n, [(grid, wp.float32), (points, wp.vec3)], outs, device=grid.device, shared=(0,))
+    (out,) = call(sample_grid_kernel, n, [grid, points], [(n, grid.shape[3])], shared=(0,))
     return out
 
 
@@ -51,8 +49,7 @@ class _SquaredLaplacian(torch.autograd.Function):
     def forward(ctx, field, weight):
         product, rows = torch.empty_like(field), field.shape[0] * field.shape[1]
         total = field.new_empty(rows)
-        arrays = [(field, wp.float32), (weight, wp.float32), (product, wp.float32), (total, wp.float32)]
-        launch(weighted_laplacian_kernel, rows, arrays, field.device, slice_min=ROWS_MIN)
+        launch(weighted_laplacian_kernel, rows, [field, weight, product, total], field.device, slice_min=ROWS_MIN)
         ctx.save_for_backward(field, product)
         return total.sum()
 
@@ -61,6 +58,6 @@ class _SquaredLaplacian(torch.autograd.Function):
     def backward(ctx, g_total):
         field, product = ctx.saved_tensors
         g_field, rows = torch.empty_like(field), field.shape[0] * field.shape[1]
-        arrays = [(product, wp.float32), (g_total.reshape(1).contiguous(), wp.float32), (g_field, wp.float32)]
+        arrays = [product, g_total.reshape(1).contiguous(), g_field]
         launch(weighted_laplacian_adjoint_kernel, rows, arrays, field.device, slice_min=ROWS_MIN)
         return g_field, None

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import call, check
@@ -37,13 +36,6 @@ class Hits:
         return self.face >= 0
 
 
-_INTERPOLATE = {
-    2: (kernels.interpolate2_kernel, wp.vec2),
-    3: (kernels.interpolate3_kernel, wp.vec3),
-    4: (kernels.interpolate4_kernel, wp.vec4),
-}
-
-
 def interpolate(values: Tensor, faces: Tensor, face: Tensor, bary: Tensor) -> Tensor:
     """Vertex attribute ``values (V, C)``, C = 2, 3 or 4, interpolated at hits: ``(..., C)``, 0 for a miss.
 
@@ -51,14 +43,13 @@ def interpolate(values: Tensor, faces: Tensor, face: Tensor, bary: Tensor) -> Te
     ``bary``.  Raises ValueError for an index out of range.
     """
     check("values", values)
-    if values.ndim != 2 or values.shape[1] not in _INTERPOLATE:
+    if values.ndim != 2 or values.shape[1] not in kernels.INTERPOLATE:
         raise ValueError(f"values: expected shape (V, C) with C = 2, 3 or 4, got {tuple(values.shape)}")
     _check_faces(values.shape[0], faces, face, values)
     check("bary", bary, last=2, like=values)
-    kernel, kind = _INTERPOLATE[values.shape[1]]
     n = face.numel()
-    ins = [(values, kind), (faces, wp.int32), (face.reshape(-1), wp.int32), (bary.reshape(-1, 2), wp.vec2)]
-    (out,) = call(kernel, n, ins, [((n,), kind)], device=values.device, shared=(0,))
+    ins = [values, faces, face.reshape(-1), bary.reshape(-1, 2)]
+    (out,) = call(kernels.INTERPOLATE[values.shape[1]], n, ins, [(n,)], shared=(0,))
     return out.reshape(*face.shape, values.shape[1])
 
 
@@ -70,8 +61,7 @@ def hit_normals(vertices: Tensor, faces: Tensor, face: Tensor) -> Tensor:
     check("vertices", vertices, last=3)
     _check_faces(vertices.shape[0], faces, face, vertices)
     n = face.numel()
-    ins = [(vertices, wp.vec3), (faces, wp.int32), (face.reshape(-1), wp.int32)]
-    (out,) = call(kernels.hit_normal_kernel, n, ins, [((n,), wp.vec3)], device=vertices.device, shared=(0,))
+    (out,) = call(kernels.hit_normal_kernel, n, [vertices, faces, face.reshape(-1)], [(n,)], shared=(0,))
     return out.reshape(*face.shape, 3)
 
 
@@ -91,17 +81,8 @@ def evaluate_hits(vertices: Tensor, faces: Tensor, hits: Hits, origins: Tensor, 
     shape = hits.face.shape
     o, d = (v.expand(*shape, 3).reshape(-1, 3) for v in (origins, directions))
     n = o.shape[0]
-    ins = [
-        (vertices, wp.vec3),
-        (faces, wp.int32),
-        (hits.face.reshape(-1), wp.int32),
-        (o, wp.vec3),
-        (d, wp.vec3),
-        (hits.t.detach().reshape(-1), wp.float32),
-        (hits.bary.detach().reshape(-1, 2), wp.vec2),
-    ]
-    outs = [((n,), wp.float32), ((n,), wp.vec2)]
-    t, bary = call(kernels.reevaluate_kernel, n, ins, outs, device=vertices.device, shared=(0,))
+    ins = [vertices, faces, hits.face.reshape(-1), o, d, hits.t.detach().reshape(-1), hits.bary.detach().reshape(-1, 2)]
+    t, bary = call(kernels.reevaluate_kernel, n, ins, [(n,), (n,)], shared=(0,))
     return Hits(hits.face, t.reshape(shape), bary.reshape(*shape, 2))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import check, launch
@@ -36,11 +35,11 @@ def mask_distance(masks: Tensor) -> Tensor:
         kernels.mask_distance_kernel,
         masks.numel(),
         [
-            (masks, wp.float32),
+            masks,
             *_nearest_crossing(masks),
             *_nearest_crossing(masks.transpose(1, 2).contiguous()),
             math.hypot(height, width),
-            (distance, wp.float32),
+            distance,
         ],
         masks.device,
     )
@@ -52,14 +51,9 @@ def _nearest_crossing(masks: Tensor) -> list:
     views, height, width = masks.shape
     rows, begin = torch.empty_like(masks), torch.empty_like(masks)
     apex, nearest = (torch.empty_like(masks, dtype=torch.int32) for _ in range(2))
-    launch(kernels.column_kernel, views * width, [(masks, wp.float32), (rows, wp.float32)], masks.device)
-    launch(
-        kernels.row_kernel,
-        views * height,
-        [(rows, wp.float32), (apex, wp.int32), (begin, wp.float32), (nearest, wp.int32)],
-        masks.device,
-    )
-    return [(rows, wp.float32), (nearest, wp.int32)]
+    launch(kernels.column_kernel, views * width, [masks, rows], masks.device)
+    launch(kernels.row_kernel, views * height, [rows, apex, begin, nearest], masks.device)
+    return [rows, nearest]
 
 
 def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: float = math.inf) -> Tensor:
@@ -77,7 +71,7 @@ def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: floa
     if not far >= 0.0:
         raise ValueError(f"far: expected at least 0, got {far}")
     hull = torch.empty(len(points), device=points.device, dtype=torch.float32)
-    inputs = [(points.detach().contiguous(), wp.vec3), *_views(distance, camera), far, (hull, wp.float32)]
+    inputs = [points.detach().contiguous(), *_views(distance, camera), far, hull]
     launch(kernels.hull_distance_kernel, len(points), inputs, points.device)
     return hull
 
@@ -94,7 +88,7 @@ def hull_grid(axis: Tensor, distance: Tensor, camera: Camera, *, far: float = ma
         raise ValueError(f"far: expected at least 0, got {far}")
     n = len(axis)
     hull = axis.new_empty(n, n, n)
-    inputs = [(axis.detach().contiguous(), wp.float32), *_views(distance, camera), far, (hull, wp.float32)]
+    inputs = [axis.detach().contiguous(), *_views(distance, camera), far, hull]
     launch(kernels.hull_grid_kernel, (-(-n // kernels.BLOCK_POINTS)) ** 3, inputs, axis.device, slice_min=BLOCKS_MIN)
     return hull
 
@@ -122,9 +116,9 @@ def mirror_residual(
         raise ValueError(f"most: expected at least 0, got {most}")
     _check_views(points, distance, camera)
     residual = points.new_empty(len(normal), len(points))
-    rays = [(points.detach().contiguous(), wp.vec3), (known.contiguous(), wp.bool)]
-    planes = [(normal.detach().contiguous(), wp.vec3), (offset.detach().contiguous(), wp.float32)]
-    inputs = [*rays, *planes, float(most), *_views(distance, camera), (residual, wp.float32)]
+    rays = [points.detach().contiguous(), known.contiguous()]
+    planes = [normal.detach().contiguous(), offset.detach().contiguous()]
+    inputs = [*rays, *planes, float(most), *_views(distance, camera), residual]
     launch(kernels.mirror_residual_kernel, residual.numel(), inputs, points.device)
     return residual
 
@@ -146,8 +140,8 @@ def hull_span(origins: Tensor, directions: Tensor, radius: float, distance: Tens
         raise ValueError(f"radius: expected between 0 and 100, got {radius}")
     _check_views(origins, distance, camera)
     span = torch.empty(len(origins), 2, device=origins.device, dtype=torch.float32)
-    rays = [(v.detach().contiguous(), wp.vec3) for v in (origins, directions)]
-    inputs = [*rays, float(radius), *_views(distance, camera), (span, wp.vec2)]
+    rays = [v.detach().contiguous() for v in (origins, directions)]
+    inputs = [*rays, float(radius), *_views(distance, camera), span]
     launch(kernels.hull_span_kernel, len(origins), inputs, origins.device)
     return span
 
@@ -161,5 +155,4 @@ def _check_views(points: Tensor, distance: Tensor, camera: Camera) -> None:
 
 def _views(distance: Tensor, camera: Camera) -> list:
     """Kernel arguments: the views' distances and cameras."""
-    views = (distance, wp.float32), (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4)
-    return [(value.detach().contiguous(), kind) for value, kind in views]
+    return [value.detach().contiguous() for value in (distance, camera.c2w, camera.intrinsics)]

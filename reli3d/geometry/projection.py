@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import call, check
@@ -27,6 +26,5 @@ def gather_views(maps: Tensor, points: Tensor, camera: Camera) -> tuple[Tensor, 
         raise ValueError(f"points: expected (N, 3), got {tuple(points.shape)}")
     check_camera(camera, like=maps, views=views)
     camera = camera.detach().resized(maps.shape[2], maps.shape[1])
-    ins = [(maps, wp.float32), (points, wp.vec3), (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4)]
-    outs = [((n, views, maps.shape[3]), wp.float32), ((n, views), wp.vec3)]
-    return call(gather_views_kernel, n * views, ins, outs, device=maps.device, shared=(0, 1))
+    ins = [maps, points, camera.c2w, camera.intrinsics]
+    return call(gather_views_kernel, n * views, ins, [(n, views, maps.shape[3]), (n, views)], shared=(0, 1))

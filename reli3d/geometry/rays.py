@@ -119,12 +119,10 @@ class RayScene:
         shape, o, d, far = self._rays(origins, directions, t_max)
         n = o.shape[0]
         face, t, bary = (empty((n,), kind, self.device) for kind in (wp.int32, wp.float32, wp.vec2))
-        outs = [(face, wp.int32), (t, wp.float32), (bary, wp.vec2)]
         if self._embree is not None:
-            self._trace(embree_kernels.embree_closest_kernel, "rtcIntersect1", o, d, far, outs)
+            self._trace(embree_kernels.embree_closest_kernel, "rtcIntersect1", o, d, far, [face, t, bary])
         elif self._warp is not None:
-            args = [self._warp.id, (o, wp.vec3), (d, wp.vec3), (far, wp.float32), *outs]
-            launch(kernels.closest_kernel, n, args, self.device)
+            launch(kernels.closest_kernel, n, [self._warp.id, o, d, far, face, t, bary], self.device)
         else:
             face.fill_(-1), t.fill_(torch.inf), bary.zero_()
         return Hits(face.reshape(shape), t.reshape(shape), bary.reshape(*shape, 2))
@@ -134,10 +132,9 @@ class RayScene:
         shape, o, d, far = self._rays(origins, directions, t_max)
         out = torch.zeros(o.shape[0], dtype=torch.bool, device=self.device)
         if self._embree is not None:
-            self._trace(embree_kernels.embree_occluded_kernel, "rtcOccluded1", o, d, far, [(out, wp.bool)])
+            self._trace(embree_kernels.embree_occluded_kernel, "rtcOccluded1", o, d, far, [out])
         elif self._warp is not None:
-            args = [self._warp.id, (o, wp.vec3), (d, wp.vec3), (far, wp.float32), (out, wp.bool)]
-            launch(kernels.occluded_kernel, o.shape[0], args, self.device)
+            launch(kernels.occluded_kernel, o.shape[0], [self._warp.id, o, d, far, out], self.device)
         return out.reshape(shape)
 
     def unoccluded(self, origins: Tensor, directions: Tensor, t_max: Tensor) -> Tensor:
@@ -149,8 +146,7 @@ class RayScene:
         if self._embree is None:
             return (t_max >= 0.0) & ~self.occluded(origins, directions, t_max=t_max)
         left, group = t_max.clone(memory_format=torch.contiguous_format), embree_kernels.GROUP
-        rays = [(origins.contiguous(), wp.vec3), (directions.contiguous(), wp.vec3), (left, wp.float32)]
-        args = [embree.query("rtcOccluded16"), self._embree.scene, *rays]
+        args = [embree.query("rtcOccluded16"), self._embree.scene, origins.contiguous(), directions.contiguous(), left]
         launch(
             embree_kernels.embree_unoccluded_kernel,
             -(-len(left) // group),
@@ -222,13 +218,12 @@ class RayScene:
 
         def work(_, start, count):
             part = slice(start, start + count)
-            rays, answers = [o[part], d[part], far if far.numel() == 1 else far[part]], [v[part] for v, _ in outs]
+            rays, answers = [o[part], d[part], far if far.numel() == 1 else far[part]], [v[part] for v in outs]
             order, found = self._order(*rays[:2]), answers
             if order is not None:  # numpy's take and its assignment: torch's take 4 times as long
                 rays = [v if len(v) == 1 else torch.from_numpy(np.take(v.numpy(), order, 0, mode="clip")) for v in rays]
                 found = [torch.empty_like(v) for v in answers]
-            args = [*zip(rays, (wp.vec3, wp.vec3, wp.float32)), *zip(found, (kind for _, kind in outs))]
-            launch(kernel, count, [address, self.embree_scene, *args], o.device, slice_min=count)
+            launch(kernel, count, [address, self.embree_scene, *rays, *found], o.device, slice_min=count)
             if order is not None:
                 for answer, v in zip(answers, found, strict=True):
                     _items(answer)[order] = _items(v)
@@ -245,7 +240,7 @@ class RayScene:
         if n < SLICE_RAYS:
             return None
         key = empty((n,), wp.int16, o.device)
-        args = [(o, wp.vec3), (d, wp.vec3), *self._cells, (key, wp.int16)]
+        args = [o, d, *self._cells, key]
         launch(embree_kernels.ray_key_kernel, -(-n // embree_kernels.RUN), args, o.device, slice_min=n)
         keys = key.numpy()
         if np.count_nonzero(keys[1:] != keys[:-1]) < 0.5 * n:
@@ -269,7 +264,7 @@ def offset_origin(position: Tensor, ng: Tensor, direction: Tensor, *, scale: flo
     check("ng", ng, last=3, like=position)
     check("direction", direction, last=3, like=position)
     shape = np.broadcast_shapes(position.shape, ng.shape, direction.shape)
-    ins = [(v.detach().expand(shape).reshape(-1, 3).contiguous(), wp.vec3) for v in (position, ng, direction)]
-    out = empty((ins[0][0].shape[0],), wp.vec3, position.device)
-    launch(kernels.offset_origin_kernel, out.shape[0], [*ins, float(scale), (out, wp.vec3)], position.device)
+    ins = [v.detach().expand(shape).reshape(-1, 3).contiguous() for v in (position, ng, direction)]
+    out = empty((ins[0].shape[0],), wp.vec3, position.device)
+    launch(kernels.offset_origin_kernel, out.shape[0], [*ins, float(scale), out], position.device)
     return out.reshape(shape)

@@ -22,8 +22,6 @@ from reli3d.geometry.mesh import Mesh
 from reli3d.kernels import flexicubes as kernels
 from reli3d.kernels.flexicubes_tables import tables
 
-I32 = wp.int32
-
 
 @dataclass(frozen=True)
 class _Topology:
@@ -43,15 +41,15 @@ class _Topology:
     def surface(self) -> kernels.SurfaceCubes:
         """The kernels' view of it."""
         names = ("cells", "rows", "resolved", "counts", "base", "slot")
-        return struct_of(kernels.SurfaceCubes, **{name: (getattr(self, name), I32) for name in names})
+        return struct_of(kernels.SurfaceCubes, **{name: getattr(self, name) for name in names})
 
     def grid(self, sdf: Tensor, shift: Tensor | None) -> kernels.Grid:
         """The kernels' grid of the padded ``sdf`` and the offsets before padding."""
         shift = sdf.new_empty(0, 3) if shift is None else shift.view(-1, 3)
         return struct_of(
             kernels.Grid,
-            sdf=(sdf.view(-1), wp.float32),
-            shift=(shift, wp.vec3),
+            sdf=sdf.view(-1),
+            shift=shift,
             ny=self.shape[1],
             nz=self.shape[2],
             cubes=wp.vec3i(*self.cubes),
@@ -67,7 +65,7 @@ def tables_on(device: torch.device) -> dict[str, Tensor]:
 @lru_cache(8)
 def _struct_of_tables(device: torch.device) -> kernels.Tables:
     table = tables_on(device)
-    return struct_of(kernels.Tables, **{name: (table[name], I32) for name in ("group", "ends", "around")})
+    return struct_of(kernels.Tables, **{name: table[name] for name in ("group", "ends", "around")})
 
 
 def surface_cubes(sdf: Tensor) -> Tensor:
@@ -177,7 +175,7 @@ def _classify(sdf: Tensor) -> tuple[Tensor, Tensor]:
     launch(
         kernels.classify_kernel,
         sdf.shape[0] * sdf.shape[1],
-        [(sdf.view(-1), wp.float32), *sdf.shape, (case.view(-1), wp.uint8), (crossed.view(-1), wp.uint8)],
+        [sdf.view(-1), *sdf.shape, case.view(-1), crossed.view(-1)],
         sdf.device,
     )
     return case, crossed
@@ -215,16 +213,7 @@ def topology_of(sdf: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topol
     launch(
         kernels.resolve_kernel,
         len(cells),
-        [
-            (cells, I32),
-            (case.view(-1), wp.uint8),
-            (table["neighbor"], I32),
-            (table["count"], I32),
-            *sdf.shape[1:],
-            (resolved, I32),
-            (counts, I32),
-            (slot, I32),
-        ],
+        [cells, case.view(-1), table["neighbor"], table["count"], *sdf.shape[1:], resolved, counts, slot],
         device,
     )
     base = torch.zeros_like(counts)
@@ -257,7 +246,7 @@ class _DualVertices(torch.autograd.Function):
         launch(
             kernels.dual_vertex_kernel,
             len(cube),
-            [(cube, I32), (group, I32), *_DualVertices.arguments(t, padded, inputs, scale), (vertices, wp.vec3)],
+            [cube, group, *_DualVertices.arguments(t, padded, inputs, scale), vertices],
             device,
         )
         ctx.topology, ctx.scale, ctx.given = topology, scale, [v is not None for v in (deformation, alpha, beta)]
@@ -267,7 +256,7 @@ class _DualVertices(torch.autograd.Function):
     @staticmethod
     def arguments(t: _Topology, padded: Tensor, inputs: list, scale: tuple) -> list:
         none = padded.new_empty(0)
-        alpha, beta = ((none if v is None else v.view(-1), wp.float32) for v in inputs[1:])
+        alpha, beta = (none if v is None else v.view(-1) for v in inputs[1:])
         weights = struct_of(kernels.Weights, alpha=alpha, beta=beta)
         return [t.surface, _struct_of_tables(padded.device), t.grid(padded, inputs[0]), weights, wp.vec3(*scale)]
 
@@ -288,11 +277,11 @@ class _DualVertices(torch.autograd.Function):
             n,
             [
                 *_DualVertices.arguments(t, padded, inputs, ctx.scale),
-                (g_vertices.contiguous(), wp.vec3),
-                (g_sdf.view(-1), wp.float32),
-                (g_shift.view(-1, 3), wp.vec3),
-                (g_alpha.view(-1), wp.float32),
-                (g_beta.view(-1), wp.float32),
+                g_vertices.contiguous(),
+                g_sdf.view(-1),
+                g_shift.view(-1, 3),
+                g_alpha.view(-1),
+                g_beta.view(-1),
             ],
             device,
         )
@@ -335,14 +324,14 @@ def _quads(t: _Topology, padded: Tensor, crossed: Tensor, gamma: Tensor | None) 
         kernels.quad_kernel,
         len(origin),
         [
-            (origin, I32),
-            (direction, I32),
+            origin,
+            direction,
             t.surface,
             _struct_of_tables(device),
             t.grid(padded, None),
-            (padded.new_empty(0) if gamma is None else gamma.detach().contiguous(), wp.float32),
-            (quads.view(-1), I32),
-            (split.view(-1), wp.float32),
+            padded.new_empty(0) if gamma is None else gamma.detach().contiguous(),
+            quads.view(-1),
+            split.view(-1),
         ],
         device,
     )

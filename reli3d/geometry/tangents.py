@@ -8,7 +8,6 @@ along the tangent and green along the bitangent.
 from __future__ import annotations
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import call, check, launch
@@ -46,9 +45,8 @@ def vertex_tangents(vertices: Tensor, faces: Tensor, normals: Tensor, uv: Tensor
     same, count = torch.from_numpy(first[label]).to(vertices.device), len(vertices)
     corner = torch.empty(3, len(faces), 4, dtype=torch.float64, device=vertices.device)
     side = torch.empty(3, len(faces), dtype=torch.int32, device=vertices.device)
-    ins = [(vertices, wp.vec3), (normals, wp.vec3), (uv, wp.vec2), (faces.contiguous(), wp.int32)]
-    outs = [(same.int(), wp.int32), (corner, wp.vec4d), (side, wp.int32)]
-    launch(corner_tangents_kernel, len(faces), [*ins, *outs], vertices.device)
+    ins = [vertices, normals, uv, faces.contiguous()]
+    launch(corner_tangents_kernel, len(faces), [*ins, same.int(), corner, side], vertices.device)
     side, weighted = side.flatten(), corner.flatten(0, 1).T.contiguous()
     # unmirrored, then mirrored; index_add_ is about 10 times slower
     total = torch.stack([torch.bincount(side, part, 2 * count) for part in weighted])
@@ -86,10 +84,10 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     _check_frame(normal, tangent)
     check("world", world, last=3, like=normal)
     batch = torch.broadcast_shapes(world.shape[:-1], normal.shape[:-1], tangent.shape[:-1])
-    parts = ((world, wp.vec3), (normal.detach(), wp.vec3), (tangent.detach(), wp.vec4))
-    ins = [(v.expand(*batch, v.shape[-1]).reshape(-1, v.shape[-1]), kind) for v, kind in parts]
-    n = len(ins[0][0])
-    (out,) = call(encode_normals_kernel, n, ins, [((n,), wp.vec3)], device=normal.device)
+    parts = (world, normal.detach(), tangent.detach())
+    ins = [v.expand(*batch, v.shape[-1]).reshape(-1, v.shape[-1]) for v in parts]
+    n = len(ins[0])
+    (out,) = call(encode_normals_kernel, n, ins, [(n,)])
     return out.view(*batch, 3)
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import warp as wp
 
 from reli3d._bridge import launch
 from reli3d.kernels import topology as kernels
@@ -72,8 +71,8 @@ def graph_components(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
     if len(a) and not (min(a.min(), b.min()) >= 0 and max(a.max(), b.max()) < count):
         raise ValueError(f"a, b: expected nodes in [0, {count}), got others")
     parent = torch.arange(count, dtype=torch.int32, device="cpu")
-    ends = [(torch.from_numpy(np.ascontiguousarray(v, dtype=np.int32)), wp.int32) for v in (a, b)]
-    launch(kernels.components_kernel, 1, [*ends, (parent, wp.int32)], parent.device)
+    ends = [torch.from_numpy(np.ascontiguousarray(v, dtype=np.int32)) for v in (a, b)]
+    launch(kernels.components_kernel, 1, [*ends, parent], parent.device)
     return parent.numpy()
 
 

@@ -47,23 +47,14 @@ class _SampleTriplane(torch.autograd.Function):
             order, edges = _by_cell_row(points, height, width)
         features = points.new_empty(batch, n, 3, blocks * BLOCK_CHANNELS)
         packed = planes.detach() if by_rows else packed_planes(planes)
-        inputs = (points.view(-1, 3), kernels.wp.vec3), (order.view(-1), kernels.wp.int32)
-        out, sizes = (features.view(-1, BLOCK_CHANNELS), kernels.vec8), sizes_of(n, height, width, blocks)
+        inputs = points.view(-1, 3), order.view(-1)
+        out, sizes = features.view(-1, BLOCK_CHANNELS), sizes_of(n, height, width, blocks)
         if by_rows:
             scratch = points.new_empty(batch * 3 * BANDS * 2 * (width + 2) * blocks, BLOCK_CHANNELS)
             launch(
                 kernels.sample_rows_kernel,
                 batch * 3 * BANDS,
-                [
-                    (packed.view(-1), kernels.wp.float32),
-                    *inputs,
-                    (edges.view(-1), kernels.wp.int32),
-                    sizes,
-                    channels,
-                    BANDS,
-                    (scratch, kernels.vec8),
-                    out,
-                ],
+                [packed.view(-1), *inputs, edges.view(-1), sizes, channels, BANDS, scratch, out],
                 planes.device,
                 slice_min=1,
             )
@@ -72,7 +63,7 @@ class _SampleTriplane(torch.autograd.Function):
             launch(
                 kernels.sample_kernel,
                 batch * n * 3 * split,
-                [(packed.view(-1, BLOCK_CHANNELS), kernels.vec8), *inputs, sizes, split, out],
+                [packed.view(-1, BLOCK_CHANNELS), *inputs, sizes, split, out],
                 planes.device,
             )
         sorted_points = (order, edges) if ctx.needs_input_grad[0] else (None, None)
@@ -129,7 +120,7 @@ def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tenso
     launch(
         kernels.cell_key_kernel,
         slabs * n,
-        [(points.view(-1, 3), kernels.wp.vec3), sizes_of(n, height, width, 0), bins, (keys.view(-1), kernels.wp.int32)],
+        [points.view(-1, 3), sizes_of(n, height, width, 0), bins, keys.view(-1)],
         points.device,
     )
     edges = keys.new_zeros(slabs, height + 2)
@@ -158,11 +149,11 @@ def _points_adjoint(packed: Tensor, points: Tensor, g: Tensor) -> Tensor:
         kernels.points_adjoint_kernel,
         batch * n,
         [
-            (packed.view(-1, BLOCK_CHANNELS), kernels.vec8),
-            (points.view(-1, 3), kernels.wp.vec3),
-            (g.view(-1, BLOCK_CHANNELS), kernels.vec8),
+            packed.view(-1, BLOCK_CHANNELS),
+            points.view(-1, 3),
+            g.view(-1, BLOCK_CHANNELS),
             sizes_of(n, height, width, channels // BLOCK_CHANNELS),
-            (g_points.view(-1, 3), kernels.wp.vec3),
+            g_points.view(-1, 3),
         ],
         points.device,
     )
@@ -180,14 +171,14 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
             kernels.planes_adjoint_kernel,
             batch * 3 * ((height + 2 - parity) // 2) * split,
             [
-                (points.view(-1, 3), kernels.wp.vec3),
-                (g.view(-1, BLOCK_CHANNELS), kernels.vec8),
-                (order.view(-1), kernels.wp.int32),
-                (edges.view(-1), kernels.wp.int32),
+                points.view(-1, 3),
+                g.view(-1, BLOCK_CHANNELS),
+                order.view(-1),
+                edges.view(-1),
                 sizes,
                 parity,
                 split,
-                (g_planes.view(-1, BLOCK_CHANNELS), kernels.vec8),
+                g_planes.view(-1, BLOCK_CHANNELS),
             ],
             points.device,
             slice_min=ROWS_MIN,

@@ -15,7 +15,6 @@ import tempfile
 
 import numpy as np
 import torch
-import warp as wp
 from torch import Tensor
 
 from reli3d import _bridge
@@ -161,11 +160,8 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
     cell = max(1.0, size / CELLS)
     cells = int(size / cell)
     sequence = torch.from_numpy(np.lexsort((np.arange(count), -extent[:, 0], -extent[:, 1])).astype(np.int32))
-    inputs = (torch.from_numpy(edge_start), wp.int32), (torch.from_numpy(edges), wp.vec2)
-    place, top_cell = (
-        torch.empty(count, 4, dtype=torch.int32, device="cpu"),
-        torch.empty(1, dtype=torch.int32, device="cpu"),
-    )
+    inputs = torch.from_numpy(edge_start), torch.from_numpy(edges)
+    place, top_cell = (torch.empty(*shape, dtype=torch.int32, device="cpu") for shape in ((count, 4), (1,)))
     horizon = torch.empty(cells, dtype=torch.int32, device="cpu")
     strip = int(np.ceil((reserved + 0.5 * guard) / cell)) if reserved else 0
 
@@ -175,26 +171,12 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
         if width.max() > cells:
             return 1 << 30
         column_start = np.concatenate([[0], np.cumsum(width)]).astype(np.int32)
-        start = torch.from_numpy(column_start), wp.int32
+        start = torch.from_numpy(column_start)
         bottom, top = torch.empty(2, int(column_start[-1]), dtype=torch.int32, device="cpu")
-        outline = (bottom, wp.int32), (top, wp.int32)
-        _bridge.launch(
-            kernels.outline_kernel, count, [*inputs, start, scale / cell, margin / cell, *outline], parts.CPU
-        )
-        _bridge.launch(
-            kernels.pack_serial_kernel,
-            1,
-            [
-                (sequence, wp.int32),
-                start,
-                *outline,
-                strip,
-                (horizon, wp.int32),
-                (place, wp.int32),
-                (top_cell, wp.int32),
-            ],
-            parts.CPU,
-        )
+        args = [*inputs, start, scale / cell, margin / cell, bottom, top]
+        _bridge.launch(kernels.outline_kernel, count, args, parts.CPU)
+        args = [sequence, start, bottom, top, strip, horizon, place, top_cell]
+        _bridge.launch(kernels.pack_serial_kernel, 1, args, parts.CPU)
         return int(top_cell)
 
     while True:

@@ -34,11 +34,9 @@ def visible_from(
     count = n * views if active is None else len(pair)
     origin, direction = (position.new_empty(count, 3) for _ in range(2))
     distance = position.new_empty(count)
-    ins = (position, wp.vec3), (normal, wp.vec3), (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4), (pair, wp.int32)
-    outs = (origin, wp.vec3), (direction, wp.vec3), (distance, wp.float32)
-    arrays = [(v.detach().contiguous(), kind) for v, kind in ins]
+    arrays = [v.detach().contiguous() for v in (position, normal, camera.c2w, camera.intrinsics, pair)]
     size = wp.vec2(float(camera.width), float(camera.height))
-    launch(sight_kernel, count, [*arrays, size, MIN_COSINE, *outs], position.device)
+    launch(sight_kernel, count, [*arrays, size, MIN_COSINE, origin, direction, distance], position.device)
     free = scene.unoccluded(origin, direction, distance)
     if active is not None:
         free = active.T.clone(memory_format=torch.contiguous_format).masked_scatter_(active.T, free)

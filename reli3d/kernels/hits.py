@@ -7,6 +7,8 @@ gradients depend on the square of the result.
 between texel centers at ((column + .5) / T, (row + .5) / T) and repeat in both axes (glTF's default wrap).
 """
 
+from typing import Any
+
 import warp as wp
 
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
@@ -27,15 +29,15 @@ def wrap(k: int, size: int) -> int:
 
 
 @wp.kernel
-def interpolate2_kernel(
+def interpolate_kernel(
     start: int,
     # in
-    values: wp.array[wp.vec2],
+    values: wp.array[Any],
     faces: wp.array2d[wp.int32],
     face: wp.array[wp.int32],
     bary: wp.array[wp.vec2],
     # out
-    out: wp.array[wp.vec2],
+    out: wp.array[Any],
 ):
     i = start + wp.tid()
     f = face[i]
@@ -43,47 +45,13 @@ def interpolate2_kernel(
         b = bary[i]
         out[i] = values[faces[f, 0]] * (1.0 - b[0] - b[1]) + values[faces[f, 1]] * b[0] + values[faces[f, 2]] * b[1]
     else:
-        out[i] = wp.vec2(0.0, 0.0)
+        out[i] = out.dtype()
 
 
-@wp.kernel
-def interpolate3_kernel(
-    start: int,
-    # in
-    values: wp.array[wp.vec3],
-    faces: wp.array2d[wp.int32],
-    face: wp.array[wp.int32],
-    bary: wp.array[wp.vec2],
-    # out
-    out: wp.array[wp.vec3],
-):
-    i = start + wp.tid()
-    f = face[i]
-    if f >= 0:
-        b = bary[i]
-        out[i] = values[faces[f, 0]] * (1.0 - b[0] - b[1]) + values[faces[f, 1]] * b[0] + values[faces[f, 2]] * b[1]
-    else:
-        out[i] = wp.vec3(0.0, 0.0, 0.0)
-
-
-@wp.kernel
-def interpolate4_kernel(
-    start: int,
-    # in
-    values: wp.array[wp.vec4],
-    faces: wp.array2d[wp.int32],
-    face: wp.array[wp.int32],
-    bary: wp.array[wp.vec2],
-    # out
-    out: wp.array[wp.vec4],
-):
-    i = start + wp.tid()
-    f = face[i]
-    if f >= 0:
-        b = bary[i]
-        out[i] = values[faces[f, 0]] * (1.0 - b[0] - b[1]) + values[faces[f, 1]] * b[0] + values[faces[f, 2]] * b[1]
-    else:
-        out[i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
+INTERPOLATE = {  # by the number of channels
+    channels: wp.overload(interpolate_kernel, {"values": wp.array[kind], "out": wp.array[kind]})
+    for channels, kind in ((2, wp.vec2), (3, wp.vec3), (4, wp.vec4))
+}
 
 
 @wp.kernel

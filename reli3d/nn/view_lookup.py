@@ -6,7 +6,6 @@ the pooling over the views into one kernel, without gradient; their callers have
 
 from __future__ import annotations
 
-import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import check, launch, struct_of
@@ -16,7 +15,6 @@ from reli3d.kernels.view_features import (
     fuse_views_kernel,
     pool_views_kernel,
     spread_views_kernel,
-    vec8,
     view_summary_kernel,
 )
 
@@ -37,8 +35,7 @@ def summarize_views(
     """
     n, out, viewed = _summary(images, camera, points, visible, normal)
     numbers, weight = points.new_empty(n, len(images), NUMBERS), points.new_empty(n, len(images))
-    outs = [(numbers, wp.float32), (weight, wp.float32), (out, wp.float32)]
-    launch(view_summary_kernel, n, [viewed, *outs], points.device)
+    launch(view_summary_kernel, n, [viewed, numbers, weight, out], points.device)
     return numbers, weight, out
 
 
@@ -68,9 +65,8 @@ def pool_views(
         )
     check("mix", mix, shape=(NUMBERS, hidden), like=images)
     pooled = points.new_empty(n, hidden)
-    layer = [(t.detach().contiguous().unflatten(-1, (-1, BLOCK_CHANNELS)), vec8) for t in (tokens, mix)]
-    outs = [(pooled.unflatten(-1, (-1, BLOCK_CHANNELS)), vec8), (out, wp.float32)]
-    launch(pool_views_kernel, n, [viewed, *layer, *outs], points.device)
+    layer = [t.detach().contiguous().unflatten(-1, (-1, BLOCK_CHANNELS)) for t in (tokens, mix)]
+    launch(pool_views_kernel, n, [viewed, *layer, pooled.unflatten(-1, (-1, BLOCK_CHANNELS)), out], points.device)
     return pooled, out
 
 
@@ -95,10 +91,9 @@ def spread_views(
         check(name, value, like=images)
         if tuple(value.shape) != shape or (name == "tokens" and min(shape[1:3]) < 2):
             raise ValueError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
-    layers = [(value.detach().contiguous().unflatten(-1, (-1, BLOCK_CHANNELS)), vec8) for value, _ in shapes.values()]
+    layers = [value.detach().contiguous().unflatten(-1, (-1, BLOCK_CHANNELS)) for value, _ in shapes.values()]
     pooled = points.new_empty(n, 2 * SPREAD)
-    outs = [(pooled.unflatten(-1, (-1, BLOCK_CHANNELS)), vec8), (out, wp.float32)]
-    launch(spread_views_kernel, n, [viewed, *layers, *outs], points.device)
+    launch(spread_views_kernel, n, [viewed, *layers, pooled.unflatten(-1, (-1, BLOCK_CHANNELS)), out], points.device)
     return pooled, out
 
 
@@ -120,10 +115,8 @@ def fuse_views(
     if pixels.ndim != 5 or pixels.shape[:2] != (3, len(images)) or min(pixels.shape[2:4]) < 2:
         raise ValueError(f"pixels: expected (3, {len(images)}, P, P, 4), P at least 2, got {tuple(pixels.shape)}")
     n, _, viewed = _summary(images, camera, points, visible, normal)
-    maps = [(part, wp.vec4) for part in pixels.detach().contiguous()]
     logit, numbers, shading = points.new_empty(n, 3), points.new_empty(n, 10), points.new_empty(n, 3)
-    outs = [(logit, wp.vec3), (numbers, wp.float32), (shading, wp.vec3)]
-    launch(fuse_views_kernel, n, [viewed, *maps, *outs], points.device)
+    launch(fuse_views_kernel, n, [viewed, *pixels.detach().contiguous(), logit, numbers, shading], points.device)
     return logit, numbers, shading
 
 
@@ -144,13 +137,7 @@ def _summary(images, camera, points, visible, normal) -> tuple[int, Tensor, View
         check("normal", normal, last=3, like=points)
         if len(visible) != n or len(normal) != n:
             raise ValueError(f"visible, normal: expected {n} rows, got {len(visible)} and {len(normal)}")
-    arrays = {
-        "image": (images, wp.vec4),
-        "c2w": (camera.c2w, wp.mat44),
-        "intrinsics": (camera.intrinsics, wp.vec4),
-        "points": (points, wp.vec3),
-        "normal": (normal, wp.vec3),
-        "visible": (visible, wp.float32),
-    }
-    viewed = struct_of(Viewed, **{name: (v.detach().contiguous(), kind) for name, (v, kind) in arrays.items()})
+    arrays = {"image": images, "c2w": camera.c2w, "intrinsics": camera.intrinsics, "points": points}
+    arrays |= {"normal": normal, "visible": visible}
+    viewed = struct_of(Viewed, **{name: value.detach().contiguous() for name, value in arrays.items()})
     return n, points.new_empty(n, NUMBERS), viewed

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import full_precision, launch
@@ -140,8 +139,7 @@ def _draw(
     origins, directions, value, density = (
         torch.empty(n, count, 3, device=device, dtype=torch.float32) for _ in range(4)
     )
-    outs = [(v, wp.vec3) for v in (origins, directions, value, density)]
-    launch(kernels.pilot_kernel, n, [*ins, *outs], device, slice_min=8)
+    launch(kernels.pilot_kernel, n, [*ins, origins, directions, value, density], device, slice_min=8)
     if scene is not None and scene.faces.shape[0]:
         value[scene.occluded(origins, directions)] = 0.0
     if not bool(torch.isfinite(value).all()):

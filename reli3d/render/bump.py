@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import call, check
@@ -21,7 +20,7 @@ def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
     values = (position.detach(), normal.detach(), bump)
     for name, value in zip(("position", "normal", "bump"), values, strict=True):
         check(name, value, last=3, like=bump, dtype=value.dtype)
-    ins = [(v.float().reshape(-1, 3), wp.vec3) for v in torch.broadcast_tensors(*values)]
-    n = len(ins[0][0])
-    (out,) = call(radial_bump_kernel, n, ins, [((n,), wp.vec3)], device=bump.device)
+    ins = [v.float().reshape(-1, 3) for v in torch.broadcast_tensors(*values)]
+    n = len(ins[0])
+    (out,) = call(radial_bump_kernel, n, ins, [(n,)])
     return out.view(torch.broadcast_shapes(*(v.shape for v in values)))

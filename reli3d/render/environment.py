@@ -45,16 +45,6 @@ class EnvironmentCDF:
     column_guide: Tensor
     density: Tensor
 
-    @property
-    def sampler(self) -> list[tuple[Tensor, type]]:
-        """The four arrays that ``sample_envmap`` takes, with their Warp types."""
-        return [
-            (self.rows, wp.float32),
-            (self.columns, wp.float32),
-            (self.row_guide, wp.int32),
-            (self.column_guide, wp.int32),
-        ]
-
 
 @dataclass(frozen=True)
 class Environment:
@@ -175,7 +165,7 @@ class Environment:
         flat, cdf = u.detach().reshape(-1, 2).contiguous(), self.cdf
         n = flat.shape[0]
         directions, pdf = empty((n,), wp.vec3, flat.device), empty((n,), wp.float32, flat.device)
-        args = [*cdf.sampler, (cdf.density, wp.float32), (flat, wp.vec2), (directions, wp.vec3), (pdf, wp.float32)]
+        args = [cdf.rows, cdf.columns, cdf.row_guide, cdf.column_guide, cdf.density, flat, directions, pdf]
         launch(kernels.sample_envmap_kernel, n, args, flat.device)
         return directions.reshape(*u.shape[:-1], 3), pdf.reshape(u.shape[:-1])
 
@@ -184,8 +174,7 @@ class Environment:
         check("directions", directions, last=3, like=self.radiance)
         flat = directions.detach().reshape(-1, 3).contiguous()
         pdf = empty((flat.shape[0],), wp.float32, flat.device)
-        args = [(self.cdf.density, wp.float32), (flat, wp.vec3), (pdf, wp.float32)]
-        launch(kernels.pdf_envmap_kernel, flat.shape[0], args, flat.device)
+        launch(kernels.pdf_envmap_kernel, flat.shape[0], [self.cdf.density, flat, pdf], flat.device)
         return pdf.reshape(directions.shape[:-1])
 
 
@@ -195,8 +184,7 @@ class _Lookup(torch.autograd.Function):
     @staticmethod
     def forward(ctx, radiance: Tensor, directions: Tensor) -> Tensor:
         out = empty((directions.shape[0],), wp.vec3, directions.device)
-        args = [(radiance, wp.vec3), (directions, wp.vec3), (out, wp.vec3)]
-        launch(kernels.lookup_envmap_kernel, directions.shape[0], args, directions.device)
+        launch(kernels.lookup_envmap_kernel, directions.shape[0], [radiance, directions, out], directions.device)
         ctx.save_for_backward(radiance, directions)
         return out
 
@@ -210,10 +198,10 @@ class _Lookup(torch.autograd.Function):
         parts = slices(n, least) if device.type == "cpu" else [(0, n)]
         g_radiance = torch.zeros(len(parts), height if needed[0] else 0, width, 3, device=device, dtype=torch.float32)
         g_directions = torch.empty(n if needed[1] else 0, 3, device=device, dtype=torch.float32)
-        ins = [(radiance, wp.vec3), (directions, wp.vec3), (g_out.contiguous(), wp.vec3)]
+        ins = [radiance, directions, g_out.contiguous()]
 
         def work(k, start, count):
-            outs = [(g_radiance[k], wp.vec3), (g_directions, wp.vec3)]
+            outs = [g_radiance[k], g_directions]
             launch(kernels.lookup_adjoint_kernel, count, [start, *ins, *outs], device, slice_min=count)
 
         if n and device.type == "cpu":

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import call, check, expect
@@ -50,16 +49,9 @@ class SphericalGaussians:
 
     def _sum(self, kernel, name: str, at: Tensor) -> Tensor:
         check(name, at, last=3, like=self.axis)
-        flat = at.reshape(-1, 3)
-        n = flat.shape[0]
-        ins = [*self.arrays, (flat, wp.vec3)]
-        (out,) = call(kernel, n, ins, [((n,), wp.vec3)], device=flat.device, shared=(0, 1, 2))
+        flat, n = at.reshape(-1, 3), at.numel() // 3
+        (out,) = call(kernel, n, [self.axis, self.sharpness, self.amplitude, flat], [(n,)], shared=(0, 1, 2))
         return out.reshape(at.shape)
-
-    @property
-    def arrays(self) -> list[tuple[Tensor, type]]:
-        """The three tensors with their Warp types, in the order of the kernels."""
-        return [(self.axis, wp.vec3), (self.sharpness, wp.float32), (self.amplitude, wp.vec3)]
 
 
 def shade_gaussians(points: SurfacePoints, wo: Tensor, light: SphericalGaussians) -> Tensor:
@@ -77,13 +69,6 @@ def shade_gaussians(points: SurfacePoints, wo: Tensor, light: SphericalGaussians
     normal, n = points.normal, len(points)
     check("points.normal", normal, like=light.axis)
     wo, width = of_rows("wo", wo, points.position, 3), points.roughness * points.roughness
-    ins = [
-        (normal, wp.vec3),
-        (wo, wp.vec3),
-        (points.base_color, wp.vec3),
-        (width, wp.float32),
-        (points.metallic, wp.float32),
-        *light.arrays,
-    ]
-    (out,) = call(kernels.shade_sg_kernel, n, ins, [((n,), wp.vec3)], device=normal.device, shared=(5, 6, 7))
+    ins = [normal, wo, points.base_color, width, points.metallic, *vars(light).values()]
+    (out,) = call(kernels.shade_sg_kernel, n, ins, [(n,)], shared=(5, 6, 7))
     return out + nan_where_not_finite([normal, wo, points.base_color, width, points.metallic])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-import warp as wp
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -36,8 +35,7 @@ def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
         raise ValueError("uv: expected finite coordinates of magnitude below 1e6, got others")
     flat = uv.reshape(-1, 2)
     n = flat.shape[0]
-    ins = [(texture, wp.vec3), (flat, wp.vec2)]
-    (out,) = call(kernels.sample_texture_kernel, n, ins, [((n,), wp.vec3)], device=uv.device, shared=(0,))
+    (out,) = call(kernels.sample_texture_kernel, n, [texture, flat], [(n,)], shared=(0,))
     return out.reshape(*uv.shape[:-1], 3)
 
 

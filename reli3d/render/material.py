@@ -56,9 +56,8 @@ def eval_bsdf(
     batch, flat = _flat(
         [("wo", wo, 3), ("wi", wi, 3), ("base_color", base_color, 3), ("alpha", alpha, 0), ("metallic", metallic, 0)]
     )
-    kinds = (wp.vec3, wp.vec3, wp.vec3, wp.float32, wp.float32)
     n = flat[0].shape[0]
-    (out,) = call(kernels.eval_bsdf_kernel, n, [*zip(flat, kinds), conserving], [((n,), wp.vec3)], device=wo.device)
+    (out,) = call(kernels.eval_bsdf_kernel, n, [*flat, conserving], [(n,)])
     return out.reshape(*batch, 3)
 
 
@@ -109,7 +108,7 @@ def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") ->
 def pdf_lobes(wo: Tensor, alpha: Tensor, wi: Tensor) -> Tensor:
     """:func:`pdf_bsdf` for each of :data:`LOBES`, ``(..., 3)``."""
     batch, flat = _flat([("wo", wo, 3), ("wi", wi, 3), ("alpha", alpha, 0)])
-    ins = [(t.detach().contiguous(), kind) for t, kind in zip(flat, (wp.vec3, wp.vec3, wp.float32))]
+    ins = [t.detach().contiguous() for t in flat]
     out = empty((flat[0].shape[0],), wp.vec3, wo.device)
-    launch(kernels.pdf_lobes_kernel, out.shape[0], [*ins, (out, wp.vec3)], wo.device)
+    launch(kernels.pdf_lobes_kernel, out.shape[0], [*ins, out], wo.device)
     return out.reshape(*batch, 3)

@@ -19,7 +19,7 @@ def sample_cosine(u: Tensor) -> Tensor:
     check("u", u, last=2)
     flat = u.detach().reshape(-1, 2).contiguous()
     out = empty((flat.shape[0],), wp.vec3, u.device)
-    launch(kernels.sample_cosine_kernel, flat.shape[0], [(flat, wp.vec2), (out, wp.vec3)], u.device)
+    launch(kernels.sample_cosine_kernel, flat.shape[0], [flat, out], u.device)
     return out.reshape(*u.shape[:-1], 3)
 
 
@@ -45,12 +45,12 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
     check("u", u, last=2, like=wo)
     batch = torch.broadcast_shapes(wo.shape[:-1], alpha.shape, u.shape[:-1])
     ins = [
-        (wo.expand(*batch, 3).reshape(-1, 3), wp.vec3),
-        (alpha.expand(batch).reshape(-1), wp.float32),
-        (u.detach().expand(*batch, 2).reshape(-1, 2), wp.vec2),
+        wo.expand(*batch, 3).reshape(-1, 3),
+        alpha.expand(batch).reshape(-1),
+        u.detach().expand(*batch, 2).reshape(-1, 2),
     ]
     n = batch.numel()
-    (wm,) = call(microfacet.sample_ggx_vndf_kernel, n, ins, [((n,), wp.vec3)], device=wo.device)
+    (wm,) = call(microfacet.sample_ggx_vndf_kernel, n, ins, [(n,)])
     return wm.reshape(*batch, 3)
 
 
@@ -69,13 +69,9 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
     check("alpha", alpha, like=wo)
     check("wm", wm, last=3, like=wo)
     batch = torch.broadcast_shapes(wo.shape[:-1], alpha.shape, wm.shape[:-1])
-    ins = [
-        (wo.expand(*batch, 3).reshape(-1, 3), wp.vec3),
-        (alpha.expand(batch).reshape(-1), wp.float32),
-        (wm.expand(*batch, 3).reshape(-1, 3), wp.vec3),
-    ]
+    ins = [wo.expand(*batch, 3).reshape(-1, 3), alpha.expand(batch).reshape(-1), wm.expand(*batch, 3).reshape(-1, 3)]
     n = batch.numel()
-    (pdf,) = call(microfacet.pdf_ggx_vndf_kernel, n, ins, [((n,), wp.float32)], device=wo.device)
+    (pdf,) = call(microfacet.pdf_ggx_vndf_kernel, n, ins, [(n,)])
     return pdf.reshape(batch)
 
 
@@ -143,8 +139,7 @@ def random_pairs(
     Source: pcg4d of Jarzynski and Olano 2020, the first two of its four words, 24 bits each.
     """
     out = empty((count,), wp.vec2, torch.device(device))
-    args = [int(seed) & 0x7FFFFFFF, int(sample), int(dimension), (out, wp.vec2)]
-    launch(random.random_pair_kernel, count, args, out.device)
+    launch(random.random_pair_kernel, count, [int(seed) & 0x7FFFFFFF, int(sample), int(dimension), out], out.device)
     return out
 
 
@@ -153,5 +148,5 @@ def halton(count: int, *, first: int = 1, device: torch.device | str = "cpu") ->
     if first < 0 or count < 0:
         raise ValueError(f"first, count: expected at least 0, got {first}, {count}")
     out = empty((count,), wp.vec2, torch.device(device))
-    launch(random.halton_kernel, count, [int(first), (out, wp.vec2)], out.device)
+    launch(random.halton_kernel, count, [int(first), out], out.device)
     return out

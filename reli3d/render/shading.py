@@ -22,7 +22,7 @@ from reli3d._bridge import (
     present,
     slices,
     struct_of,
-    views,
+    view,
 )
 from reli3d.geometry import embree
 from reli3d.geometry.rays import RayScene
@@ -197,12 +197,11 @@ def _direct(job: _Job, tensors: Sequence[Tensor], words: int = 0) -> tuple[Tenso
     visible = torch.zeros(n, words, dtype=torch.int32, device=position.device)
     out = empty((n,), wp.vec3, position.device)
     ins = _inputs(tensors, job)
-    outs = [(out, wp.vec3), (visible, wp.int32)]
     if job.scene is not None and job.scene.backend == "embree" and job.scene.faces.shape[0]:
-        _shade_embree(n, ins, job, outs)
+        _shade_embree(n, ins, job, out, visible)
     else:
         mesh = job.scene.mesh_id if job.scene is not None else 0
-        launch(kernels.shade_kernel, n, [*ins, job.plan, mesh, int(mesh != 0), *outs], position.device)
+        launch(kernels.shade_kernel, n, [*ins, job.plan, mesh, int(mesh != 0), out, visible], position.device)
     out += nan_where_not_finite(tensors[:7])
     return out, visible
 
@@ -231,14 +230,14 @@ class _Shade(torch.autograd.Function):
         )
         g_radiance = texels.repeat(parts, 1, 1, 1)  # of each slice
         ins = _inputs(tensors, ctx.job)
-        ins += [ctx.job.plan, (visible, wp.int32), (g_out.contiguous(), wp.vec3)]
-        outs = [(g_normal, wp.vec3), (g_base, wp.vec3), (g_alpha, wp.float32), (g_metallic, wp.float32)]
+        ins += [ctx.job.plan, visible, g_out.contiguous()]
+        outs = [g_normal, g_base, g_alpha, g_metallic]
 
         def work(k, start, length):
             size = SLICE_MIN if device.type == "cpu" else length  # a launch this small stays in its thread
             for first in range(start, start + length, size):
                 hits = min(size, start + length - first)
-                args = [first, *ins, *outs, (g_radiance[k], wp.vec3)]
+                args = [first, *ins, *outs, g_radiance[k]]
                 launch(adjoint.shade_adjoint_kernel, hits, args, device)
 
         if n and ctx.job.count:
@@ -259,44 +258,29 @@ def _inputs(tensors: Sequence[Tensor], job: _Job) -> list:
 def struct_of_points(values: Sequence[Tensor], pixels: Tensor) -> kernels.Points:
     """Contiguous arrays in the order of :func:`shaded_arrays`, and the seed index of each point."""
     names = ("position", "normal", "ng", "wo", "base_color", "alpha", "metallic")
-    kinds = [wp.vec3] * 5 + [wp.float32] * 2
-    return struct_of(kernels.Points, **dict(zip(names, zip(values, kinds), strict=True)), pixel=(pixels, wp.int32))
+    return struct_of(kernels.Points, **dict(zip(names, values, strict=True)), pixel=pixels)
 
 
 def struct_of_light(radiance: Tensor, cdf: EnvironmentCDF, offsets: Tensor) -> kernels.Light:
     """Contiguous texels, their sampling CDF, and the low-discrepancy points, not yet rotated."""
-    rows, columns, row_guide, column_guide = cdf.sampler
-    return struct_of(
-        kernels.Light,
-        radiance=(radiance, wp.vec3),
-        rows=rows,
-        columns=columns,
-        row_guide=row_guide,
-        column_guide=column_guide,
-        density=(cdf.density, wp.float32),
-        points=(offsets, wp.vec2),
-    )
+    return struct_of(kernels.Light, radiance=radiance, **vars(cdf), points=offsets)
 
 
-def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
+def _shade_embree(n: int, ins: list, job: _Job, out: Tensor, visible: Tensor) -> None:
     """Shades chunks of hits: one kernel generates shadow rays and values, another traces them by Embree and sums."""
-    out, count, tracer = (
-        outs[0][0],
-        job.count,
-        (embree.query("rtcOccluded16"), present("scene", job.scene).embree_scene),
-    )
+    count, tracer = job.count, (embree.query("rtcOccluded16"), present("scene", job.scene).embree_scene)
     if count == 0:
         out.zero_()
         return
     size = max(1, CHUNK_RAYS // count)
     group = max(1, GROUP_RAYS // count)
-    outs = views(outs)  # once: a third of the cost of a chunk without its rays
-    (known,) = views([(job.known, wp.int32)])
+    # views once for all chunks: a third of the cost of a chunk without its rays
+    known, outs = view(job.known, wp.int32), [view(out, wp.vec3), view(visible, wp.int32)]
 
     def work(_, start, length):
         buffers = [torch.empty(min(size, length) * count, 3, dtype=torch.float32, device="cpu") for _ in range(3)]
         far = torch.empty(min(size, length) * count, dtype=torch.float32, device="cpu")
-        origins, directions, values, t_max = views([*((v, wp.vec3) for v in buffers), (far, wp.float32)])
+        origins, directions, values, t_max = *(view(v, wp.vec3) for v in buffers), view(far, wp.float32)
         for first in range(start, start + length, size):
             hits = min(size, start + length - first)
             args = [first, *ins, job.plan, known, origins, directions, t_max, values]

@@ -122,22 +122,21 @@ def march_rays(
         raise ValueError(f"shift: expected ({n},) numbers in [0, 1), got {tuple(shift.shape)} or others")
     device = origins.device
     rays = [
-        (grid.occupied.contiguous().view(torch.uint8), wp.uint8),
-        (origins.detach().contiguous(), wp.vec3),
-        (directions.detach().contiguous(), wp.vec3),
-        (shift.detach().contiguous(), wp.float32),
+        grid.occupied.contiguous().view(torch.uint8),
+        origins.detach().contiguous(),
+        directions.detach().contiguous(),
+        shift.detach().contiguous(),
     ]
     numbers = [float(grid.radius), float(step), float(near), float(min(far, 3.0e38))]
     count = torch.zeros(n, dtype=torch.int32, device=device)
-    launch(kernels.count_samples_kernel, n, [*rays, *numbers, (count, wp.int32)], device)
+    launch(kernels.count_samples_kernel, n, [*rays, *numbers, count], device)
     total = torch.nn.functional.pad(count.long().cumsum(0), (1, 0))
     if int(total[-1]) >= 2**31:
         raise ValueError(f"step: expected fewer than 2**31 samples, got {int(total[-1])}")
     first = total.int()
     ray = torch.empty(int(total[-1]), dtype=torch.int32, device=device)
     t = torch.empty(int(total[-1]), device=device, dtype=torch.float32)
-    outs = [(ray, wp.int32), (t, wp.float32)]
-    launch(kernels.emit_samples_kernel, n, [*rays, *numbers, (first, wp.int32), *outs], device)
+    launch(kernels.emit_samples_kernel, n, [*rays, *numbers, first, ray, t], device)
     return RaySamples(ray, t, first, float(step))
 
 
@@ -148,13 +147,9 @@ def composite(density: Tensor, color: Tensor, samples: RaySamples) -> Composite:
     are exactly 0 for a density that is not positive.  Once differentiable.  Bitwise identical for any number of
     threads.  Source: Max 1995, Optical Models for Direct Volume Rendering.
     """
-    _check_samples(density, samples)
+    check("density", density, shape=samples.t.shape, like=samples.t)
     check("color", color, shape=(len(density), 3), like=density)
     return Composite(*_Composite.apply(samples, density.contiguous(), color.contiguous()))
-
-
-def _check_samples(density: Tensor, samples: RaySamples) -> None:
-    check("density", density, shape=samples.t.shape, like=samples.t)
 
 
 class _Composite(torch.autograd.Function):
@@ -163,28 +158,19 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, samples: RaySamples, density: Tensor, color: Tensor):
         n, device = len(samples.first) - 1, density.device
-        outs = [(empty((n,), kind, device), kind) for kind in (wp.vec3, wp.float32, wp.float32)]
+        outs = [empty((n,), kind, device) for kind in (wp.vec3, wp.float32, wp.float32)]
         tensors = (density, color, samples.t, samples.first)
-        launch(kernels.composite_kernel, n, [*_inputs(tensors, samples.step), *outs], device)
+        launch(kernels.composite_kernel, n, [*tensors, samples.step, *outs], device)
         ctx.step = samples.step
         ctx.save_for_backward(*tensors)
-        return tuple(out for out, _ in outs)
+        return tuple(outs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, g_color: Tensor, g_opacity: Tensor, g_depth: Tensor):
         tensors, (_, *needed) = ctx.saved_tensors, ctx.needs_input_grad
         # gradients that are not needed have no rows, and the kernel skips them
-        outs = [
-            (torch.zeros_like(v if w else v[:0]), kind)
-            for v, w, kind in zip(tensors, needed, (wp.float32, wp.vec3), strict=False)
-        ]
-        gs = [(g_color.contiguous(), wp.vec3), (g_opacity.contiguous(), wp.float32), (g_depth.contiguous(), wp.float32)]
-        args = [*_inputs(tensors, ctx.step), *gs, *outs]
-        launch(kernels.composite_adjoint_kernel, len(tensors[3]) - 1, args, g_color.device)
-        return None, *(g if w else None for (g, _), w in zip(outs, needed, strict=True))
-
-
-def _inputs(tensors: tuple[Tensor, ...], step: float) -> list:
-    kinds = (wp.float32, wp.vec3, wp.float32, wp.int32)  # density, color, t, first
-    return [*zip(tensors, kinds, strict=True), step]
+        outs = [torch.zeros_like(v if w else v[:0]) for v, w in zip(tensors[:2], needed, strict=True)]
+        gs = [g_color.contiguous(), g_opacity.contiguous(), g_depth.contiguous()]
+        launch(kernels.composite_adjoint_kernel, len(tensors[3]) - 1, [*tensors, ctx.step, *gs, *outs], g_color.device)
+        return None, *(g if w else None for g, w in zip(outs, needed, strict=True))

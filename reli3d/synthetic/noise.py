@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from reli3d import _bridge
@@ -24,15 +23,7 @@ def fbm(
         raise ValueError(f"octaves: expected 1 to 16, got {octaves}")
     value = points.new_empty(len(points))
     gradient = torch.empty_like(points)
-    args = [
-        (points, wp.vec3),
-        int(octaves),
-        float(gain),
-        int(ridged),
-        int(seed) & 0xFFFFFF,
-        (value, wp.float32),
-        (gradient, wp.vec3),
-    ]
+    args = [points, int(octaves), float(gain), int(ridged), int(seed) & 0xFFFFFF, value, gradient]
     _bridge.launch(kernels.fbm_kernel, len(points), args, points.device)
     return value, gradient
 
@@ -47,7 +38,7 @@ def cells(points: Tensor, *, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     distance = points.new_empty((len(points), 2))
     cell = points.new_empty(len(points))
     gradient = torch.empty_like(points)
-    args = [(points, wp.vec3), int(seed) & 0xFFFFFF, (distance, wp.vec2), (cell, wp.float32), (gradient, wp.vec3)]
+    args = [points, int(seed) & 0xFFFFFF, distance, cell, gradient]
     _bridge.launch(kernels.cells_kernel, len(points), args, points.device)
     return distance, cell, gradient
 

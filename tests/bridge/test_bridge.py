@@ -60,13 +60,11 @@ def count_kernel(
 
 def gather_scale(table, index, weight, factor):
     n = len(index)
-    outs = [((n,), wp.vec3), ((n,), wp.int32)]
-    ins = [(table, wp.vec3), (index, wp.int32), (weight, wp.float32), factor]
-    return _bridge.call(gather_scale_kernel, n, ins, outs, device=table.device, shared=(0,))
+    return _bridge.call(gather_scale_kernel, n, [table, index, weight, factor], [(n,), (n,)], shared=(0,))
 
 
 def square(x):
-    return _bridge.call(square_kernel, len(x), [(x, wp.float32)], [((len(x),), wp.float32)], device=x.device)[0]
+    return _bridge.call(square_kernel, len(x), [x], [(len(x),)])[0]
 
 
 def operands(n, device, rows=11):
@@ -85,14 +83,14 @@ def test_few_heavy_threads_are_cut_by_their_own_minimum(device, threads, n, slic
     seen = _bridge.over_slices(n, lambda k, start, count: (start, count), slice_min=slice_min)
     assert seen == _bridge.slices(n, slice_min)
     visits = torch.ones(n, dtype=torch.int32, device=device)
-    _bridge.launch(count_kernel, n, [(visits, wp.int32)], device, slice_min=slice_min)
+    _bridge.launch(count_kernel, n, [visits], device, slice_min=slice_min)
     assert torch.equal(visits, 1 + torch.arange(n, dtype=torch.int32, device=device))
 
 
 @pytest.mark.parametrize("n", SIZES)
 def test_launch_visits_every_index_once(device, n):
     visits = torch.ones(n, dtype=torch.int32, device=device)
-    _bridge.launch(count_kernel, n, [(visits, wp.int32)], device)
+    _bridge.launch(count_kernel, n, [visits], device)
     assert torch.equal(visits, 1 + torch.arange(n, dtype=torch.int32, device=device))
 
 
@@ -241,7 +239,7 @@ def test_threads_load_a_kernel_one_after_the_other(threads, monkeypatch):
 
     def work(k, start, count):
         part = visits[start : start + count]
-        _bridge.launch(count_kernel, count, [(part, wp.int32)], part.device, slice_min=count)
+        _bridge.launch(count_kernel, count, [part], part.device, slice_min=count)
 
     _bridge.over_slices(len(visits), work)
     assert concurrent_with_first == [0] and len(began) >= 8
