@@ -78,6 +78,22 @@ def surface_cubes(sdf: Tensor) -> Tensor:
     return case[:-1, :-1, :-1].reshape(-1).nonzero().squeeze(1)
 
 
+def surface_points(sdf: Tensor, cubes: Tensor) -> tuple[Tensor, Tensor]:
+    """The grid vertices on which the surface depends: ascending indices ``(N,)`` in ``sdf.view(-1)``, and the positions
+    ``(K, 8)`` in this list of the corners of ``cubes (K,)``, the surface cubes.
+    """
+    (y, z), k = sdf.shape[1:], torch.arange(8, device=sdf.device, dtype=torch.int64)
+    i, rest = cubes // ((y - 1) * (z - 1)), cubes % ((y - 1) * (z - 1))
+    lowest = (i * y + rest // (z - 1)) * z + rest % (z - 1)
+    corners = lowest[:, None] + ((k & 1) * y + (k >> 1 & 1)) * z + (k >> 2)
+    needed = torch.zeros_like(sdf, dtype=torch.bool)
+    for side in range(3):  # where the inside reaches the box, the cap uses the vertices of the border
+        for end in (0, -1):
+            needed.select(side, end)[sdf.select(side, end) < 0] = True
+    needed.view(-1)[corners] = True
+    return needed.view(-1).nonzero()[:, 0], (torch.cumsum(needed.view(-1), 0) - 1)[corners]
+
+
 def extract_surface(
     sdf: Tensor,
     *,
@@ -172,12 +188,8 @@ def _check_sdf(sdf: Tensor) -> None:
 
 def _classify(sdf: Tensor) -> tuple[Tensor, Tensor]:
     case, crossed = torch.empty_like(sdf, dtype=torch.uint8), torch.empty_like(sdf, dtype=torch.uint8)
-    launch(
-        kernels.classify_kernel,
-        sdf.shape[0] * sdf.shape[1],
-        [sdf.view(-1), *sdf.shape, case.view(-1), crossed.view(-1)],
-        sdf.device,
-    )
+    arguments = [sdf.view(-1), *sdf.shape, case.view(-1), crossed.view(-1)]
+    launch(kernels.classify_kernel, sdf.shape[0] * sdf.shape[1], arguments, sdf.device)
     return case, crossed
 
 
@@ -210,12 +222,8 @@ def topology_of(sdf: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topol
     resolved, counts = torch.empty_like(cells), torch.empty_like(cells)
     slot = torch.empty(sdf.numel(), dtype=torch.int32, device=device)
     table = tables_on(device)
-    launch(
-        kernels.resolve_kernel,
-        len(cells),
-        [cells, case.view(-1), table["neighbor"], table["count"], *sdf.shape[1:], resolved, counts, slot],
-        device,
-    )
+    given = [cells, case.view(-1), table["neighbor"], table["count"], *sdf.shape[1:]]
+    launch(kernels.resolve_kernel, len(cells), [*given, resolved, counts, slot], device)
     base = torch.zeros_like(counts)
     start = 0
     for n in range(1, 5):  # the published order: cubes with one dual vertex first, then those with two, ...
@@ -243,12 +251,8 @@ class _DualVertices(torch.autograd.Function):
         group = torch.arange(len(cube), dtype=torch.int32, device=device) - t.base[cube.long()]
         vertices = torch.empty(len(cube), 3, device=device, dtype=torch.float32)
         inputs = [None if v is None else v.detach().contiguous() for v in (deformation, alpha, beta)]
-        launch(
-            kernels.dual_vertex_kernel,
-            len(cube),
-            [cube, group, *_DualVertices.arguments(t, padded, inputs, scale), vertices],
-            device,
-        )
+        arguments = [cube, group, *_DualVertices.arguments(t, padded, inputs, scale), vertices]
+        launch(kernels.dual_vertex_kernel, len(cube), arguments, device)
         ctx.topology, ctx.scale, ctx.given = topology, scale, [v is not None for v in (deformation, alpha, beta)]
         ctx.save_for_backward(padded, sdf, *(v for v in (deformation, alpha, beta) if v is not None))
         return vertices
@@ -272,19 +276,9 @@ class _DualVertices(torch.autograd.Function):
         n = len(t.cells)
         g_sdf, g_alpha, g_beta = (torch.zeros(n, width, device=device, dtype=torch.float32) for width in (8, 8, 12))
         g_shift = torch.zeros(n, 8, 3, device=device, dtype=torch.float32)
-        launch(
-            flexicubes_adjoint.dual_vertex_adjoint_kernel,
-            n,
-            [
-                *_DualVertices.arguments(t, padded, inputs, ctx.scale),
-                g_vertices.contiguous(),
-                g_sdf.view(-1),
-                g_shift.view(-1, 3),
-                g_alpha.view(-1),
-                g_beta.view(-1),
-            ],
-            device,
-        )
+        adjoints = [g_sdf.view(-1), g_shift.view(-1, 3), g_alpha.view(-1), g_beta.view(-1)]
+        arguments = [*_DualVertices.arguments(t, padded, inputs, ctx.scale), g_vertices.contiguous(), *adjoints]
+        launch(flexicubes_adjoint.dual_vertex_adjoint_kernel, n, arguments, device)
         corner = corner_vertices(t).view(-1)
         grads: list[Tensor | None] = [None, None, None, None]
         if ctx.needs_input_grad[3]:
@@ -320,21 +314,9 @@ def _quads(t: _Topology, padded: Tensor, crossed: Tensor, gamma: Tensor | None) 
     origin, direction = starts[which].to(torch.int32), direction.to(torch.int32)
     quads = torch.empty(len(origin), 4, dtype=torch.int32, device=device)
     split = torch.empty(len(origin), 4, device=device, dtype=torch.float32)
-    launch(
-        kernels.quad_kernel,
-        len(origin),
-        [
-            origin,
-            direction,
-            t.surface,
-            _struct_of_tables(device),
-            t.grid(padded, None),
-            padded.new_empty(0) if gamma is None else gamma.detach().contiguous(),
-            quads.view(-1),
-            split.view(-1),
-        ],
-        device,
-    )
+    weights = padded.new_empty(0) if gamma is None else gamma.detach().contiguous()
+    inputs = [origin, direction, t.surface, _struct_of_tables(device), t.grid(padded, None), weights]
+    launch(kernels.quad_kernel, len(origin), [*inputs, quads.view(-1), split.view(-1)], device)
     return quads, split
 
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from reli3d.geometry.hull import hull_distance, hull_grid
-from reli3d.geometry.surface import surface_cubes
+from reli3d.geometry.surface import surface_cubes, surface_points
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.view_features import ViewMaps
@@ -100,32 +100,15 @@ class TriplaneField(Field):
 
         points: ``(N, 3)``, the grid points in the order of ``sdf``.
         """
-        model = self.model
-        cubes, (y, z) = surface_cubes(sdf), sdf.shape[1:]
-        i, rest = cubes // ((y - 1) * (z - 1)), cubes % ((y - 1) * (z - 1))
-        lowest = (i * y + rest // (z - 1)) * z + rest % (z - 1)
-        k = torch.arange(8, device=points.device, dtype=torch.int64)
-        corners = lowest[:, None] + ((k & 1) * y + (k >> 1 & 1)) * z + (k >> 2)
-        needed = torch.zeros_like(sdf, dtype=torch.bool)
-        for side in range(3):  # where the object reaches the box, the cap uses the border vertices
-            for end in (0, -1):
-                needed.select(side, end)[sdf.select(side, end) < 0] = True
-        needed.view(-1)[corners] = True
-        at = needed.view(-1).nonzero()[:, 0]
+        model, cubes = self.model, surface_cubes(sdf)
+        at, rows = surface_points(sdf, cubes)
         raw = [model.query(self.code, points[part][None], ("deformation", "flexicubes")) for part in at.split(CHUNK)]
         offset = points.new_zeros(len(points), 3)
         offset[at] = deformation(torch.cat([r["deformation"][0] for r in raw]), sdf.shape[0] - 1)
         corner = torch.cat([r["flexicubes"][0] for r in raw])
-        row = torch.cumsum(needed.view(-1), 0) - 1
-        merged = [model.merger(corner[row[part]]) for part in corners.split(CHUNK)]
-        alpha, beta, gamma = (torch.cat([getattr(m, name) for m in merged]) for name in ("alpha", "beta", "gamma"))
-        return {
-            "deformation": offset.reshape(*sdf.shape, 3),
-            "alpha": alpha,
-            "beta": beta,
-            "gamma": gamma,
-            "cubes": cubes,
-        }
+        merged = [model.merger(corner[part]) for part in rows.split(CHUNK)]
+        weights = {name: torch.cat([getattr(m, name) for m in merged]) for name in ("alpha", "beta", "gamma")}
+        return {"deformation": offset.reshape(*sdf.shape, 3), "cubes": cubes, **weights}
 
     def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
         values = {k: v[0] for k, v in self.model.query(self.code, position[None], MATERIAL).items()}

@@ -10,6 +10,7 @@ import warnings
 import pytest
 import torch
 from PIL import Image
+from safetensors import safe_open
 from torch.distributed.run import get_args_parser
 
 from reli3d.cli.train import main, paper_stage, parsed, parser
@@ -232,8 +233,11 @@ def test_a_checkpoint_is_exported_and_starts_the_next_stage(folder, tmp_path, ca
     train(stage, options_of(stage, tmp_path / "one", steps=0))
     state = tmp_path / "one" / "state.pt"
     average = checkpoint.load(state)["average"]
-    assert main([str(state.parent), "--stage", "gaussians", "--export", str(tmp_path / "x.safetensors")]) == 0
-    model = load_model(str(tmp_path / "x.safetensors"))
+    exported = str(tmp_path / "x.safetensors")
+    assert main([str(state.parent), "--stage", "gaussians", "--export", exported, "--license", "CC0-1.0"]) == 0
+    with safe_open(exported, "pt") as file:
+        assert file.metadata()["licence"] == "CC0-1.0"
+    model = load_model(exported)
     assert model.preset.name == "tiny"  # stored in half precision
     torch.testing.assert_close(model.bank.embeddings, average["bank.embeddings"], rtol=1e-3, atol=1e-4)
     call = [str(folder), str(tmp_path / "two"), "--stage", "volume", "--steps", "0", "--weights", str(state)]

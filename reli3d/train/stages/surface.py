@@ -16,7 +16,7 @@ from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
-from reli3d.geometry.surface import extract_surface, surface_cubes
+from reli3d.geometry.surface import extract_surface, surface_cubes, surface_points
 from reli3d.nn.field import MATERIAL
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
@@ -47,25 +47,14 @@ class Surface:
 
 def query_heads(model: Reconstructor, code: Code, points: Tensor, heads: tuple[str, ...]) -> dict[str, Tensor]:
     """Values ``(N, outputs)`` of the heads at ``points (N, 3)``; above CHUNK points with gradient checkpointing."""
-    if len(points) <= CHUNK or not torch.is_grad_enabled():
+    if len(points) <= CHUNK:
         return {k: v[0] for k, v in model.query(code, points[None], heads).items()}
-    parts = []
-    for part in points.split(CHUNK):
-        parts.append(
-            checkpoint(
-                lambda p: tuple(model.query(code, p[None], heads)[h][0] for h in heads), part, use_reentrant=False
-            )
-        )
+
+    def values(part: Tensor) -> tuple[Tensor, ...]:
+        return tuple(model.query(code, part[None], heads)[h][0] for h in heads)
+
+    parts = [checkpoint(values, part, use_reentrant=False) for part in points.split(CHUNK)]
     return dict(zip(heads, (torch.cat(columns) for columns in zip(*parts)), strict=True))
-
-
-def corner_points(sdf: Tensor, cubes: Tensor) -> Tensor:
-    """Grid points ``(C, 8)`` of the corners of ``cubes``; corner k is at x = k & 1, y = k >> 1 & 1, z = k >> 2."""
-    _, y, z = sdf.shape
-    i, rest = cubes // ((y - 1) * (z - 1)), cubes % ((y - 1) * (z - 1))
-    lowest = (i * y + rest // (z - 1)) * z + rest % (z - 1)
-    k = torch.arange(8, device=cubes.device)
-    return lowest[:, None] + ((k & 1) * y + (k >> 1 & 1)) * z + (k >> 2)
 
 
 def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None:
@@ -83,21 +72,14 @@ def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None
         cubes = surface_cubes(free)
         if len(cubes) == 0:
             return None
-        corners = corner_points(free, cubes)
-        needed = torch.zeros_like(free, dtype=torch.bool)
-        for side in range(3):  # where the inside reaches the box, the cap uses the grid points of the boundary
-            for end in (0, -1):
-                needed.select(side, end)[free.select(side, end) < 0] = True
-        needed.view(-1)[corners] = True
-        at = needed.view(-1).nonzero()[:, 0]
-        row = torch.cumsum(needed.view(-1), 0) - 1
+        at, rows = surface_points(free, cubes)
     raw = query_heads(model, code, points[at], ("density", "deformation", "flexicubes"))
     known = model.sdf(raw["density"][:, 0]) / threshold
     # the two passes round differently, and a sign that flips would not fit the cubes
     known = torch.where((known < 0) == (free.view(-1)[at] < 0), known, free.view(-1)[at])
     sdf = free.reshape(-1).index_copy(0, at, known).view_as(free)
     offset = torch.zeros_like(points).index_copy(0, at, deformation(raw["deformation"], resolution))
-    merged = model.merger(raw["flexicubes"].index_select(0, row[corners].reshape(-1)).view(len(cubes), 8, -1))
+    merged = model.merger(raw["flexicubes"].index_select(0, rows.reshape(-1)).view(len(cubes), 8, -1))
     weights = {"deformation": offset.view(*sdf.shape, 3), "alpha": merged.alpha, "beta": merged.beta}
     made = extract_surface(sdf, radius=radius, gamma=merged.gamma, cubes=cubes, center=True, **weights)
     mesh = Mesh(made.vertices, made.faces, vertex_normals(made.vertices, made.faces))
