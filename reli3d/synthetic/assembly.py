@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from manifold3d import Manifold, Mesh, OpType
 
+ON_BACK = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the top to -z
+ON_SIDE = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # the top to -x
 MIN_PIECE_FRACTION = 2e-3  # of the volume; smaller disconnected pieces are removed
 
 
@@ -27,6 +29,10 @@ class Assembly:
         """Number of a new part."""
         self.roles.append(role)
         return len(self.roles) - 1
+
+    def random_part(self, *roles: str, p: Sequence[float] | None = None) -> int:
+        """Number of a new part of one of ``roles``, with the probabilities ``p`` (default: equal)."""
+        return self.part(str(self.rng.choice(roles, p=p)))
 
     def add(self, solid: Manifold, part: int, at: Sequence[float] | np.ndarray | None = None) -> None:
         """Adds ``solid``, translated by ``at``."""
@@ -62,6 +68,11 @@ class Assembly:
     def warp(self, move: Callable[[np.ndarray], np.ndarray], edge: float) -> None:
         """Maps the vertices ``(N, 3)`` of the union by ``move`` after splitting edges longer than ``edge``."""
         self._solids = [self.joined().refine_to_length(edge).warp_batch(move)]
+
+    def add_corners(self, solid: Manifold, part: int, x: float, y: float, z: float) -> None:
+        """Adds ``solid`` at the four points ``(x, y, z)``, ``x`` and ``z`` with either sign."""
+        for at in ((-x, y, -z), (-x, y, z), (x, y, -z), (x, y, z)):
+            self.add(solid, part, at)
 
     def copy_turned(self, solid: Manifold, part: int, count: int) -> None:
         """Adds ``count`` copies of ``solid``, rotated by multiples of ``360 / count`` degrees about +Y."""

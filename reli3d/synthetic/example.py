@@ -21,11 +21,9 @@ def kettle(a: Assembly) -> None:
     """Adds the solids; the parts are in the order of the materials of :func:`finish`."""
     body, lid, knob, arms, grip, spout, trim, board = (a.part("any") for _ in range(8))
     height = np.linspace(0, 0.62, 32)
-    belly = p.curve(np.array([[0.44, 0], [0.5, 0.08], [0.47, 0.26], [0.37, 0.44], [0.27, 0.55], [0.235, 0.62]]), 32)[
-        :, 0
-    ]
-    a.add(p.solid_of_profile(belly, height, 72), body)
-    line = p.curve(np.array([[0.38, 0.14, 0], [0.55, 0.22, 0], [0.66, 0.42, 0], [0.76, 0.54, 0]]), 26)
+    belly = p.curve([[0.44, 0], [0.5, 0.08], [0.47, 0.26], [0.37, 0.44], [0.27, 0.55], [0.235, 0.62]], 32)
+    a.add(p.solid_of_profile(belly[:, 0], height, 72), body)
+    line = p.curve([[0.38, 0.14, 0], [0.55, 0.22, 0], [0.66, 0.42, 0], [0.76, 0.54, 0]], 26)
     width = np.linspace(0.125, 0.052, 26)
     a.add(p.tube(line, width, segments=28), spout)
     a.add(p.tube(line[-4:], width[-4:] + 0.012, segments=28), trim)
@@ -36,25 +34,11 @@ def kettle(a: Assembly) -> None:
     a.add(p.torus(0.452, 0.014, segments=72), trim, (0, 0.02, 0))
     dome = np.linspace(0, np.pi / 2, 14)
     a.add(p.solid_of_profile(0.225 * np.cos(dome), 0.62 + 0.085 * np.sin(dome), 64), lid)
-    neck = np.array(
-        [[0.035, 0.69], [0.022, 0.73], [0.03, 0.75], [0.058, 0.785], [0.056, 0.82], [0.03, 0.845], [0.004, 0.85]]
-    )
+    neck = [0.035, 0.69], [0.022, 0.73], [0.03, 0.75], [0.058, 0.785], [0.056, 0.82], [0.03, 0.845], [0.004, 0.85]
     fine = p.curve(neck, 24)
     a.add(p.solid_of_profile(fine[:, 0].clip(0.003), fine[:, 1], 40), knob)
-    arch = p.curve(
-        np.array(
-            [
-                [-0.3, 0.52, 0],
-                [-0.345, 0.72, 0],
-                [-0.2, 0.98, 0],
-                [0, 1.04, 0],
-                [0.2, 0.98, 0],
-                [0.345, 0.72, 0],
-                [0.3, 0.52, 0],
-            ]
-        ),
-        60,
-    )
+    rise = np.array([[0.3, 0.52, 0], [0.345, 0.72, 0], [0.2, 0.98, 0]])
+    arch = p.curve([*rise * (-1, 1, 1), (0, 1.04, 0), *rise[::-1]], 60)
     a.add(p.tube(arch, 0.021, segments=16), arms)
     swell = 0.04 + 0.016 * np.sin(np.linspace(0, np.pi, 24))
     a.add(p.tube(arch[18:42], swell, segments=24), grip)

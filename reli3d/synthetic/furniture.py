@@ -16,17 +16,15 @@ def _leg(a: Assembly, part: int, foot: np.ndarray, top: np.ndarray, thick: float
     rng = a.rng
     if style == 0:
         ring = thick * 0.5 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
-        corners = [
-            np.stack([ring[:, 0] * s + q[0], np.full(4, q[1]), ring[:, 1] * s + q[2]], -1)
-            for q, s in ((foot, 0.8), (top, 1.0))
-        ]
-        a.add(p.Manifold.hull_points(np.concatenate(corners)), part)
+        at = lambda q, s: np.stack([ring[:, 0] * s + q[0], np.full(4, q[1]), ring[:, 1] * s + q[2]], -1)  # noqa: E731
+        a.add(p.Manifold.hull_points(np.concatenate([at(foot, 0.8), at(top, 1.0)])), part)
     elif style == 1:
-        a.add(p.tube(np.stack([foot, top]), np.array([0.3, 0.5]) * thick, segments=16), part)
+        a.add(p.tube([foot, top], np.array([0.3, 0.5]) * thick, segments=16), part)
     else:
         t = np.linspace(0, 1, 20)[:, None]
         swell = 0.45 + 0.2 * np.sin(t[:, 0] * (10 if style == 2 else 4) + 1.0 + style) * np.sin(np.pi * t[:, 0])
-        a.add(p.tube(foot + t * (top - foot), thick * swell * (1 if rng.random() < 2 else 0), segments=14), part)
+        rng.random()  # not used, but later draws of a seed depend on it
+        a.add(p.tube(foot + t * (top - foot), thick * swell, segments=14), part)
 
 
 def _legs(a: Assembly, part: int, w: float, d: float, h: float, *, thick: float) -> None:
@@ -43,16 +41,15 @@ def _legs(a: Assembly, part: int, w: float, d: float, h: float, *, thick: float)
         out = splay * (h - y)
         for s in (-1, 1):
             a.add(p.box((2 * (x + out), t * 1.3, t), 0.1 * t), part, (0, y, s * (z + out)))
-            a.add(
-                p.box((t, t * 1.3, 2 * (z + out)), 0.1 * t), part, (s * (x + out), y * rng.choice([1.0, 1.0, 1.25]), 0)
-            )
+            side = p.box((t, t * 1.3, 2 * (z + out)), 0.1 * t)
+            a.add(side, part, (s * (x + out), y * rng.choice([1.0, 1.0, 1.25]), 0))
 
 
 def table(a: Assembly) -> None:
     """Table, desk, bench or stool: rectangular or round top, four legs, a pedestal or panel sides, apron, drawers."""
     rng, u = a.rng, a.rng.uniform
     wood = a.part("wood" if rng.random() < 0.7 else "paint")
-    top = wood if rng.random() < 0.6 else a.part(str(rng.choice(["wood", "stone", "plastic", "leather", "fabric"])))
+    top = wood if rng.random() < 0.6 else a.random_part("wood", "stone", "plastic", "leather", "fabric")
     h, w, d, t = u(0.4, 0.95), u(0.45, 1.7), u(0.4, 0.9), u(0.02, 0.07)
     if rng.random() < 0.35:  # stool
         w, d = u(0.28, 0.5), u(0.28, 0.5)
@@ -78,9 +75,8 @@ def table(a: Assembly) -> None:
         if rng.random() < 0.5:
             a.add(p.cylinder(u(0.3, 0.5) * w, 0.04, bevel=0.015), wood, (0, 0.02, 0))
         else:
-            a.copy_turned(
-                p.capsule((0, 0.12, 0), (u(0.35, 0.5) * w, 0.03, 0), 0.035, tip=0.025), wood, int(rng.integers(3, 6))
-            )
+            foot = p.capsule((0, 0.12, 0), (u(0.35, 0.5) * w, 0.03, 0), 0.035, tip=0.025)
+            a.copy_turned(foot, wood, int(rng.integers(3, 6)))
     else:
         for s in (-1, 1):
             a.add(p.box((t, h, d * 0.9)), wood, (s * (w / 2 - t), h / 2, 0))
@@ -89,11 +85,8 @@ def table(a: Assembly) -> None:
     if rng.random() < 0.2 and not rounded:
         _drawers(a, w * 0.35, 0.4 * h, d * 0.9, np.array([w * 0.28, h - 0.2 * h, 0]), wood)
     if rng.random() < 0.15:  # a vessel on top
-        a.add(
-            p.cylinder(u(0.04, 0.09), u(0.08, 0.2), top=u(0.05, 0.12)),
-            a.part("ceramic"),
-            (u(-0.3, 0.3) * w, h + 0.06, u(-0.2, 0.2) * d),
-        )
+        pot = p.cylinder(u(0.04, 0.09), u(0.08, 0.2), top=u(0.05, 0.12))
+        a.add(pot, a.part("ceramic"), (u(-0.3, 0.3) * w, h + 0.06, u(-0.2, 0.2) * d))
 
 
 def chair(a: Assembly) -> None:
@@ -101,8 +94,8 @@ def chair(a: Assembly) -> None:
     shell.
     """
     rng, u = a.rng, a.rng.uniform
-    wood = a.part(str(rng.choice(["wood", "metal", "plastic", "paint"], p=[0.55, 0.15, 0.15, 0.15])))
-    soft = a.part(str(rng.choice(["fabric", "leather"]))) if rng.random() < 0.5 else wood
+    wood = a.random_part("wood", "metal", "plastic", "paint", p=[0.55, 0.15, 0.15, 0.15])
+    soft = a.random_part("fabric", "leather") if rng.random() < 0.5 else wood
     w, d, h, t = u(0.4, 0.6), u(0.38, 0.6), u(0.36, 0.5), u(0.02, 0.05)
     back, thick, lean = u(0.3, 0.65), u(0.025, 0.05), u(0.0, 0.16)
     _legs(a, wood, w, d, h, thick=thick)
@@ -120,7 +113,7 @@ def chair(a: Assembly) -> None:
     elif style < 0.55:
         a.add(p.box((w, 0.07, 0.03), 0.012), wood, at(0, back))
         for s in np.linspace(-0.75, 0.75, int(rng.integers(3, 8))):
-            a.add(p.tube(np.stack([at(s, 0), at(s, back)]), 0.011, segments=8), wood)
+            a.add(p.tube([at(s, 0), at(s, back)], 0.011, segments=8), wood)
     else:
         high = back * u(0.45, 0.8)
         bevel = u(0.01, 0.03)
@@ -129,64 +122,43 @@ def chair(a: Assembly) -> None:
     if rng.random() < 0.35:
         for s in (-1, 1):
             y, front = h + u(0.18, 0.24), d / 2 - 0.04
-            rest = np.stack([at(s, y - h), np.array([s * w / 2, y, front])])
-            a.add(p.tube(p.curve(rest, 4), 0.022, segments=8), wood)
+            a.add(p.tube(p.curve([at(s, y - h), (s * w / 2, y, front)], 4), 0.022, segments=8), wood)
             a.add(p.cylinder(0.018, y - h, segments=8), wood, (s * w / 2, (y + h) / 2, front))
     if rng.random() < 0.25:  # bent, as a molded shell
         k = u(0.2, 0.7)
-        a.warp(
-            lambda q: (
-                q + np.stack([0 * q[:, 0], 0 * q[:, 1], -k * q[:, 0] ** 2 * (q[:, 1] > h)], -1) * -np.sign(q[:, 2:3])
-            ),
-            0.08,
-        )
+        bend = lambda q: q[:, 2] + k * q[:, 0] ** 2 * (q[:, 1] > h) * np.sign(q[:, 2])  # noqa: E731
+        a.warp(lambda q: np.column_stack([q[:, :2], bend(q)]), 0.08)
 
 
 def sofa(a: Assembly) -> None:
     """Sofa, armchair or bed: rounded blocks, cushions and short feet."""
     rng, u = a.rng, a.rng.uniform
-    soft, feet = (
-        a.part("leather" if rng.random() < 0.4 else "fabric"),
-        a.part("wood" if rng.random() < 0.6 else "metal"),
-    )
+    soft = a.part("leather" if rng.random() < 0.4 else "fabric")
+    feet = a.part("wood" if rng.random() < 0.6 else "metal")
     pillow = soft if rng.random() < 0.6 else a.part("fabric")
     w, d, h, seats = u(0.8, 2.2), u(0.7, 1.0), u(0.22, 0.36), int(rng.integers(1, 4))
     low, soften, arm, back = u(0.03, 0.18), u(0.02, 0.09), u(0.1, 0.26), u(0.35, 0.6)
     w = max(w, 0.5 * seats)
     a.add(p.box((w, h, d), soften * 0.7), soft, (0, low + h / 2, 0))
     if rng.random() < 0.85:
-        a.add(
-            p.box((w, h + back, u(0.15, 0.28)), soften).rotate((-u(0, 8), 0, 0)),
-            soft,
-            (0, low + (h + back) / 2, -d / 2 + 0.05),
-        )
+        rest = p.box((w, h + back, u(0.15, 0.28)), soften).rotate((-u(0, 8), 0, 0))
+        a.add(rest, soft, (0, low + (h + back) / 2, -d / 2 + 0.05))
         if rng.random() < 0.4:
-            a.add(
-                p.capsule((-w / 2 + 0.1, 0, 0), (w / 2 - 0.1, 0, 0), u(0.08, 0.13)),
-                soft,
-                (0, low + h + back, -d / 2 + 0.02),
-            )
+            roll = p.capsule((-w / 2 + 0.1, 0, 0), (w / 2 - 0.1, 0, 0), u(0.08, 0.13))
+            a.add(roll, soft, (0, low + h + back, -d / 2 + 0.02))
     high = u(0.12, 0.3)
     for s in (-1, 1) if rng.random() < 0.8 else ():
         a.add(p.box((arm, h + high, d), soften), soft, (s * (w / 2 + arm / 2 - 0.02), low + (h + high) / 2, 0))
         if rng.random() < 0.5:
-            a.add(
-                p.capsule((0, 0, -d / 2 + 0.1), (0, 0, d / 2 - 0.04), arm * 0.62),
-                soft,
-                (s * (w / 2 + arm / 2), low + h + high, 0),
-            )
+            roll = p.capsule((0, 0, -d / 2 + 0.1), (0, 0, d / 2 - 0.04), arm * 0.62)
+            a.add(roll, soft, (s * (w / 2 + arm / 2), low + h + high, 0))
     for k in range(seats):
         x, c = (k - (seats - 1) / 2) * w / seats, u(0.1, 0.16)
         a.add(p.box((w / seats * 0.97, c, d * 0.85), c * 0.42), pillow, (x, low + h + c * 0.35, 0.06))
         if rng.random() < 0.6:
             a.add(p.box((w / seats * 0.9, 0.4, 0.16), 0.07).rotate((-14, 0, 0)), pillow, (x, low + h + 0.26, -d * 0.24))
-    for sx in (-1, 1):
-        for sz in (-1, 1):
-            a.add(
-                p.cylinder(0.025, low + 0.05, top=0.04, segments=12),
-                feet,
-                (sx * (w / 2 - 0.06), low / 2, sz * (d / 2 - 0.07)),
-            )
+    foot = p.cylinder(0.025, low + 0.05, top=0.04, segments=12)
+    a.add_corners(foot, feet, w / 2 - 0.06, low / 2, d / 2 - 0.07)
 
 
 def _drawers(a: Assembly, w: float, h: float, d: float, at: np.ndarray, part: int) -> None:
@@ -209,7 +181,7 @@ def _drawers(a: Assembly, w: float, h: float, d: float, at: np.ndarray, part: in
 def shelf(a: Assembly) -> None:
     """Shelf, bookcase with books, cabinet, chest of drawers or cupboard."""
     rng, u = a.rng, a.rng.uniform
-    wood = a.part(str(rng.choice(["wood", "paint", "metal"], p=[0.65, 0.25, 0.1])))
+    wood = a.random_part("wood", "paint", "metal", p=[0.65, 0.25, 0.1])
     w, h, d, t = u(0.4, 1.2), u(0.5, 1.9), u(0.25, 0.55), u(0.015, 0.045)
     closed = rng.random()
     if closed < 0.4:
@@ -230,22 +202,13 @@ def shelf(a: Assembly) -> None:
             x = -w / 2 + t
             while x < w / 2 - t - 0.12 and rng.random() < 0.92:
                 wide, tall = u(0.03, 0.09), (top - y - t) * u(0.6, 0.92)
-                a.add(
-                    p.box((wide, tall, d * u(0.6, 0.85))),
-                    books[int(rng.integers(3))],
-                    (x + wide / 2, y + t + tall / 2 - 1e-3, -0.05 * d),
-                )
+                book = p.box((wide, tall, d * u(0.6, 0.85)))
+                a.add(book, books[int(rng.integers(3))], (x + wide / 2, y + t + tall / 2 - 1e-3, -0.05 * d))
                 x += wide + u(-0.001, 0.004)
     if rng.random() < 0.5:
         a.add(p.box((w * 1.06, 0.04, d * 1.1), 0.012), wood, (0, h, 0))
     if rng.random() < 0.6:
-        for sx in (-1, 1):
-            for sz in (-1, 1):
-                a.add(
-                    p.cylinder(0.02, 0.12, top=0.03, segments=12),
-                    wood,
-                    (sx * (w / 2 - 0.05), -0.05, sz * (d / 2 - 0.05)),
-                )
+        a.add_corners(p.cylinder(0.02, 0.12, top=0.03, segments=12), wood, w / 2 - 0.05, -0.05, d / 2 - 0.05)
 
 
 def vehicle(a: Assembly) -> None:
@@ -259,11 +222,8 @@ def vehicle(a: Assembly) -> None:
     a.add(p.box((long, h, w), float(rng.choice([0.01, 0.04, 0.1]))), paint, (0, r + h / 2, 0))
     cabin, x = u(0.25, 0.6) * long, u(-0.2, 0.2) * long
     tall = u(0.18, 0.4)
-    a.add(
-        p.wedge((cabin, tall, w * 0.9), u(0.5, 1.0), u(-0.1, 0.1)),
-        paint if rng.random() < 0.4 else dark,
-        (x, r + h + tall / 2 - 0.01, 0),
-    )
+    top = p.wedge((cabin, tall, w * 0.9), u(0.5, 1.0), u(-0.1, 0.1))
+    a.add(top, paint if rng.random() < 0.4 else dark, (x, r + h + tall / 2 - 0.01, 0))
     a.add(p.box((cabin * 0.6, 0.04, w * 0.88), 0.015), paint, (x, r + h + tall, 0))
     if rng.random() < 0.35:
         a.cut(p.box((long * 0.35, h, w * 0.85)), dark, (-0.28 * long, r + h * 1.25, 0))

@@ -10,16 +10,14 @@ import numpy as np
 from manifold3d import CrossSection, Manifold
 
 from reli3d.synthetic import primitives as p
-from reli3d.synthetic.assembly import Assembly
+from reli3d.synthetic.assembly import ON_BACK, ON_SIDE, Assembly
 
 
 def csg(a: Assembly) -> None:
     """Two to eight primitives, mostly axis-aligned and touching, with unions, cuts and mirrored copies."""
     rng, u = a.rng, a.rng.uniform
-    roles = [
-        a.part(str(rng.choice(["plastic", "metal", "wood", "paint", "stone", "accent", "ceramic"])))
-        for _ in range(int(rng.integers(1, 4)))
-    ]
+    drawn = "plastic", "metal", "wood", "paint", "stone", "accent", "ceramic"
+    roles = [a.random_part(*drawn) for _ in range(int(rng.integers(1, 4)))]
     size = u(0.35, 1.0, 3)
     a.add(primitive(rng, size), roles[0])
     for _ in range(int(rng.integers(1, 8))):
@@ -41,9 +39,9 @@ def csg(a: Assembly) -> None:
             copies = [solid.rotate((0, 360 * k / turn, 0)) for k in range(turn)]
         cut = rng.random() < 0.3
         for c in copies:
-            (a.cut if cut and a.joined().volume() - (a.joined() - c).volume() < 0.6 * a.joined().volume() else a.add)(
-                c, part
-            )
+            whole = a.joined() if cut else None
+            removes_little = whole is not None and whole.volume() - (whole - c).volume() < 0.6 * whole.volume()
+            (a.cut if removes_little else a.add)(c, part)
     if rng.random() < 0.08:
         a.keep_inside(p.ellipsoid(np.full(3, 0.62) * size.max(), 40), roles[0])
 
@@ -102,17 +100,14 @@ def device(a: Assembly) -> None:
     """Rounded body with a lens or dials, knobs, keys, a screen, feet and an antenna: camera, radio, toy, appliance."""
     rng, u = a.rng, a.rng.uniform
     w, h, d = u(0.6, 1.3), u(0.35, 1.1), u(0.15, 0.8)
-    body = a.part(str(rng.choice(["plastic", "paint", "metal", "wood"], p=[0.5, 0.2, 0.15, 0.15])))
-    trim = a.part(str(rng.choice(["metal", "accent", "plastic"])))
+    body = a.random_part("plastic", "paint", "metal", "wood", p=[0.5, 0.2, 0.15, 0.15])
+    trim = a.random_part("metal", "accent", "plastic")
     dark = a.part("rubber")
     bevel = float(rng.choice([0.01, 0.03, 0.08, 0.18])) * min(w, h, d) / 0.5
     a.add(p.box((w, h, d), bevel), body)
     if rng.random() < 0.3:  # a second block on top or a band around
-        a.add(
-            p.box((w * u(0.25, 0.6), h * u(0.15, 0.4), d * u(0.6, 0.95)), bevel),
-            body if rng.random() < 0.5 else trim,
-            (u(-0.2, 0.2) * w, h * 0.55, 0),
-        )
+        block = p.box((w * u(0.25, 0.6), h * u(0.15, 0.4), d * u(0.6, 0.95)), bevel)
+        a.add(block, body if rng.random() < 0.5 else trim, (u(-0.2, 0.2) * w, h * 0.55, 0))
     if rng.random() < 0.35:
         a.add(p.box((w * 1.01, h * u(0.15, 0.5), d * 1.02), bevel), dark, (0, u(-0.2, 0.15) * h, 0))
     front, kind = d / 2, rng.random()
@@ -137,7 +132,7 @@ def device(a: Assembly) -> None:
     if rng.random() < 0.5:  # rows of keys
         rows, cols = int(rng.integers(1, 5)), int(rng.integers(2, 7))
         size, low = min(0.7 * w / cols, 0.3 * h / rows) * 0.8, u(-0.45, -0.3) * h + 0.08 * h
-        keys = a.part(str(rng.choice(["plastic", "accent", "rubber"])))
+        keys = a.random_part("plastic", "accent", "rubber")
         key = (
             p.box((size, size, 0.06), 0.15 * size)
             if rng.random() < 0.6
@@ -156,38 +151,29 @@ def device(a: Assembly) -> None:
     if rng.random() < 0.3:  # carrying handle
         x, y = 0.4 * w, h / 2
         path = p.curve(
-            np.array(
-                [
-                    [-x, y - 0.03, 0],
-                    [-x * 0.9, y + 0.18, 0],
-                    [0, y + u(0.2, 0.3), 0],
-                    [x * 0.9, y + 0.18, 0],
-                    [x, y - 0.03, 0],
-                ]
-            ),
+            [
+                [-x, y - 0.03, 0],
+                [-x * 0.9, y + 0.18, 0],
+                [0, y + u(0.2, 0.3), 0],
+                [x * 0.9, y + 0.18, 0],
+                [x, y - 0.03, 0],
+            ],
             24,
         )
         a.add(p.tube(path, u(0.02, 0.04), segments=10), trim)
     if rng.random() < 0.15:
-        a.add(
-            p.cylinder(0.012, u(0.4, 0.8), segments=8).rotate((0, 0, u(-30, 30))),
-            trim,
-            (0.4 * w * rng.choice([-1, 1]), h * 0.7, -0.2 * d),
-        )
+        antenna = p.cylinder(0.012, u(0.4, 0.8), segments=8).rotate((0, 0, u(-30, 30)))
+        a.add(antenna, trim, (0.4 * w * rng.choice([-1, 1]), h * 0.7, -0.2 * d))
     if rng.random() < 0.35:
-        for sx in (-1, 1):
-            for sz in (-1, 1):
-                a.add(
-                    p.cylinder(0.045, 0.1, top=0.05, segments=16), dark, (sx * 0.38 * w, -h / 2 - 0.03, sz * 0.35 * d)
-                )
+        a.add_corners(p.cylinder(0.045, 0.1, top=0.05, segments=16), dark, 0.38 * w, -h / 2 - 0.03, 0.35 * d)
     if rng.random() < 0.12:  # on its back: keypad, telephone
-        a.transform(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]]))
+        a.transform(ON_BACK)
 
 
 def tool(a: Assembly) -> None:
     """Handle and head: hammer, axe, brush, screwdriver, sword, spoon, spanner, magnifier; upright or lying."""
     rng, u = a.rng, a.rng.uniform
-    grip, head = a.part(str(rng.choice(["wood", "plastic", "rubber"]))), a.part("metal")
+    grip, head = a.random_part("wood", "plastic", "rubber"), a.part("metal")
     tall, r, kind = u(0.7, 1.2), u(0.03, 0.07), int(rng.integers(6))
     y = np.linspace(0, tall, 20)
     shape = r * (1 + 0.25 * np.sin(y / tall * u(3, 9) + u(0, 6))) * np.linspace(1.15, 0.85, 20)
@@ -204,7 +190,6 @@ def tool(a: Assembly) -> None:
     elif kind == 2:  # blade with guard
         w, long = u(0.06, 0.14), u(0.8, 1.8)
         a.add(p.wedge((2 * w, long, u(0.02, 0.05)), u(0.05, 0.6)), head, (0, tall * 0.4 + long / 2, 0))
-        a.transform(np.diag([1, 1, 1.0]))
         a.add(p.box((u(0.25, 0.5), 0.06, 0.1), 0.02), a.part("accent"), (0, tall * 0.42, 0))
         a.add(p.ellipsoid((0.08, 0.07, 0.07)), head)
     elif kind == 3:  # shaft: screwdriver, awl, brush
@@ -221,20 +206,17 @@ def tool(a: Assembly) -> None:
         if rng.random() < 0.5:
             a.cut(p.ellipsoid((0.1, 0.14, 0.12)), head, (0, tall * 1.1, 0.12))
     if rng.random() < 0.5:
-        a.transform(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]))
+        a.transform(ON_SIDE)
     if rng.random() < 0.25:  # on a stand
         low = a.joined().bounding_box()
-        a.add(
-            p.box((max(low[3] - low[0], 0.3) * 0.9, 0.08, 0.35), 0.02),
-            a.part("wood"),
-            ((low[0] + low[3]) / 2, low[1] - 0.02, 0),
-        )
+        stand = p.box((max(low[3] - low[0], 0.3) * 0.9, 0.08, 0.35), 0.02)
+        a.add(stand, a.part("wood"), ((low[0] + low[3]) / 2, low[1] - 0.02, 0))
 
 
 def profile(a: Assembly) -> None:
     """Extruded outlines and tubes: letters made of bars, gears, brackets, signs with rims, horns and knots."""
     rng, u = a.rng, a.rng.uniform
-    part = a.part(str(rng.choice(["metal", "plastic", "wood", "paint", "stone"])))
+    part = a.random_part("metal", "plastic", "wood", "paint", "stone")
     kind = int(rng.integers(5))
     if kind == 0:  # letters of bars on a 3 x 4 grid, side by side
         for k in range(int(rng.integers(1, 4))):
@@ -256,7 +238,7 @@ def profile(a: Assembly) -> None:
                 t = 2 * np.pi * k / count
                 a.cut(p.cylinder(0.06, 2, segments=20), part, (0.31 * np.cos(t), 0, 0.31 * np.sin(t)))
         if rng.random() < 0.7:
-            a.transform(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]]))
+            a.transform(ON_BACK)
     elif kind == 2:  # smooth plate with holes: bracket, guitar body, palette
         turn = np.linspace(0, 2 * np.pi, 9)[:-1]
         outline = p.curve(np.stack([np.cos(turn) * u(0.5, 1, 8), np.sin(turn) * u(0.4, 0.9, 8)], -1), 64, closed=True)
@@ -274,7 +256,7 @@ def profile(a: Assembly) -> None:
         path = np.stack([wide * np.cos(q * turn), u(0.2, 0.4) * np.sin(r * turn), wide * np.sin(q * turn)], -1)
         a.add(p.tube(path, u(0.07, 0.14), closed=True, segments=14), part)
         if rng.random() < 0.5:
-            a.transform(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]]))
+            a.transform(ON_BACK)
     else:  # horn: a coiled tube that opens
         turns, count = u(0.6, 2.2), 90
         done = np.linspace(0, 1, count)

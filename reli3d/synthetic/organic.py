@@ -24,9 +24,8 @@ class Field:
         self.step = float((high - low).max()) / CELLS
         self.low = low - 3 * self.step
         count = np.ceil((high - self.low) / self.step).astype(int) + 4
-        self.axes = [
-            (self.low[k] + self.step * np.arange(count[k], dtype=np.float32)).astype(np.float32) for k in range(3)
-        ]
+        steps = [self.step * np.arange(n, dtype=np.float32) for n in count]
+        self.axes = [(low + step).astype(np.float32) for low, step in zip(self.low, steps)]
         self.value = np.full(tuple(count), 10.0, dtype=np.float32)
         self.label = np.zeros(tuple(count), dtype=np.int8)
 
@@ -35,9 +34,8 @@ class Field:
         start, end = np.asarray(start, dtype=np.float32), np.asarray(end, dtype=np.float32)
         line = end - start
         length = float(line @ line) + 1e-12
-        window = self._window(
-            np.minimum(start, end), np.maximum(start, end), max(radius, tip) + blend * 2 + 2 * self.step
-        )
+        margin = max(radius, tip) + blend * 2 + 2 * self.step
+        window = self._window(np.minimum(start, end), np.maximum(start, end), margin)
         x, y, z = np.meshgrid(*[axis[s] for axis, s in zip(self.axes, window)], indexing="ij", sparse=True)
         t = np.clip(((x - start[0]) * line[0] + (y - start[1]) * line[1] + (z - start[2]) * line[2]) / length, 0, 1)
         d = (x - start[0] - t * line[0]) ** 2 + (y - start[1] - t * line[1]) ** 2 + (z - start[2] - t * line[2]) ** 2
@@ -48,10 +46,8 @@ class Field:
         center, radii = np.asarray(center, dtype=np.float32), np.broadcast_to(np.asarray(radii, dtype=np.float32), 3)
         window = self._window(center - radii, center + radii, blend * 2 + 2 * self.step)
         x, y, z = np.meshgrid(*[axis[s] for axis, s in zip(self.axes, window)], indexing="ij", sparse=True)
-        q = np.sqrt(
-            ((x - center[0]) / radii[0]) ** 2 + ((y - center[1]) / radii[1]) ** 2 + ((z - center[2]) / radii[2]) ** 2
-        )
-        self._join(window, (q - 1) * float(radii.min()), blend, label)
+        x, y, z = ((v - c) / r for v, c, r in zip((x, y, z), center, radii))
+        self._join(window, (np.sqrt(x**2 + y**2 + z**2) - 1) * float(radii.min()), blend, label)
 
     def ripple(self, rng: np.random.Generator, amplitude: float, wave: float) -> None:
         """Adds six plane waves of wavelength about ``wave`` to the field."""
@@ -59,9 +55,8 @@ class Field:
         for _ in range(6):
             k = rng.normal(size=3).astype(np.float32)
             k *= 2 * np.pi / wave * rng.uniform(0.6, 1.5) / np.linalg.norm(k)
-            self.value += np.float32(amplitude / 2.5) * np.sin(
-                k[0] * x + k[1] * y + k[2] * z + np.float32(rng.uniform(0, 6.28))
-            )
+            phase = np.float32(rng.uniform(0, 6.28))
+            self.value += np.float32(amplitude / 2.5) * np.sin(k[0] * x + k[1] * y + k[2] * z + phase)
 
     def add_to(self, a: Assembly, parts: list[int]) -> None:
         """Adds the closed surface to ``a``; a face belongs to ``parts[label]`` of the primitive nearest to it."""
@@ -96,8 +91,7 @@ def surface_nets(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     shape = np.array(value.shape) - 1
     quads, points = [], []
     for axis in range(3):
-        lower = [slice(None)] * 3
-        upper = [slice(None)] * 3
+        lower, upper = [slice(None)] * 3, [slice(None)] * 3
         lower[axis], upper[axis] = slice(None, -1), slice(1, None)
         at = np.argwhere(inside[tuple(lower)] != inside[tuple(upper)])
         step = np.eye(3, dtype=int)[axis]
@@ -138,7 +132,7 @@ def creature(a: Assembly) -> None:
     f.ball(head, size * u(0.85, 1.2, 3), blend=blend)
     nose = head + np.array([size * u(1.0, 2.0), -size * u(0, 0.7), 0])
     f.limb(head, nose, size * 0.6, size * u(0.25, 0.5), blend=0.03, label=int(rng.integers(2)))
-    legs, thick, bird = [], fat * u(0.22, 0.45), rng.random() < 0.2
+    thick, bird = fat * u(0.22, 0.45), rng.random() < 0.2
     for x in (0.0,) if bird else (-long / 2, long / 2):
         for s in (-1, 1):
             hip = np.array([x, y - 0.3 * fat, s * fat * 0.6])
@@ -147,17 +141,10 @@ def creature(a: Assembly) -> None:
             f.limb(hip, knee, thick * 1.5, thick, blend=blend)
             f.limb(knee, foot, thick, thick * 0.8, blend=0.03)
             f.limb(foot, foot + (0.06, 0, 0), thick * 0.8, thick * 0.7, blend=0.03, label=1)
-            legs.append(foot)
     for s in (-1, 1):
         ear = head + np.array([-0.2 * size, 0.7 * size, s * 0.5 * size])
-        f.limb(
-            ear,
-            ear + np.array([u(-1, 0.4), u(0.2, 1.6), s * u(0, 1)]) * size,
-            size * 0.3,
-            size * u(0.08, 0.3),
-            blend=0.02,
-            label=1,
-        )
+        end = ear + np.array([u(-1, 0.4), u(0.2, 1.6), s * u(0, 1)]) * size
+        f.limb(ear, end, size * 0.3, size * u(0.08, 0.3), blend=0.02, label=1)
         if bird:
             f.ball((-0.05, y, s * fat), (long * 0.55, fat * 0.6, 0.06), blend=0.04, label=1)
     tail = p.curve(
@@ -173,7 +160,7 @@ def creature(a: Assembly) -> None:
         for s in (-1, 1):
             a.add(p.ellipsoid(np.full(3, size * 0.2), 12), eye, head + np.array([0.62, 0.35, s * 0.62]) * size)
     if statue or rng.random() < 0.1:
-        base = a.part(str(rng.choice(["wood", "stone", "metal"])))
+        base = a.random_part("wood", "stone", "metal")
         plinth = (
             p.box((long + 0.4, u(0.05, 0.2), 0.5), 0.02)
             if rng.random() < 0.5
@@ -235,7 +222,7 @@ def figure(a: Assembly) -> None:
 def shoe(a: Assembly) -> None:
     """Shoe or boot with sole, heel and opening; one or a pair."""
     rng, u = a.rng, a.rng.uniform
-    upper = a.part(str(rng.choice(["leather", "fabric", "rubber"])))
+    upper = a.random_part("leather", "fabric", "rubber")
     sole, accent = a.part("rubber"), a.part("accent")
     long, shaft, wide, heel = u(0.75, 1.0), u(0.16, 0.75), u(0.14, 0.2), u(0.0, 0.14)
     f = Field((-0.6, -0.05, -0.3), (0.6, 0.3 + shaft, 0.3))
@@ -260,7 +247,7 @@ def shoe(a: Assembly) -> None:
 def fruit(a: Assembly) -> None:
     """Fruit, vegetable, gourd, egg or mushroom: lobed bodies of revolution with stalk, bend and dents."""
     rng, u = a.rng, a.rng.uniform
-    skin = a.part(str(rng.choice(["skin", "accent", "plastic", "ceramic"])))
+    skin = a.random_part("skin", "accent", "plastic", "ceramic")
     stalk = a.part("wood")
     count = int(rng.integers(5, 7))
     knots = np.concatenate([[0.02], u(0.25, 0.62, count - 2), [0.02]])
@@ -281,39 +268,27 @@ def fruit(a: Assembly) -> None:
     if rng.random() < 0.7:
         top = tall * (1 - 0.4 * dent) + bend * 0
         path = p.curve(
-            np.array(
-                [[bend / 4, top - 0.08, 0], [bend / 4, top + 0.08, 0], [bend / 4 + u(-0.1, 0.1), top + u(0.1, 0.3), 0]]
-            ),
-            8,
+            [[bend / 4, top - 0.08, 0], [bend / 4, top + 0.08, 0], [bend / 4 + u(-0.1, 0.1), top + u(0.1, 0.3), 0]], 8
         )
         a.add(p.tube(path, np.linspace(0.045, 0.03, 8), segments=8), stalk)
     if rng.random() < 0.3:
         leaf = a.part("skin")
         for k in range(int(rng.integers(1, 7))):
-            blade = (
-                p.ellipsoid((0.2, 0.012, 0.08), 16)
-                .translate((0.2, 0, 0))
-                .rotate((0, 0, u(10, 70)))
-                .rotate((0, 57 * k, 0))
-            )
-            a.add(blade, leaf, (bend / 4, tall * (1 - 0.4 * dent), 0))
+            blade = p.ellipsoid((0.2, 0.012, 0.08), 16).translate((0.2, 0, 0)).rotate((0, 0, u(10, 70)))
+            a.add(blade.rotate((0, 57 * k, 0)), leaf, (bend / 4, tall * (1 - 0.4 * dent), 0))
 
 
 def stone(a: Assembly) -> None:
     """Stone, shell, loaf or abstract sculpture: smooth unions of ellipsoids with waves, sometimes pierced."""
     rng, u = a.rng, a.rng.uniform
-    body = a.part(str(rng.choice(["stone", "skin", "ceramic", "fabric", "metal"])))
+    body = a.random_part("stone", "skin", "ceramic", "fabric", "metal")
     other = body if rng.random() < 0.6 else a.part("accent")
     f = Field((-0.6, -0.6, -0.6), (0.6, 0.6, 0.6))
     stretch = u(0.4, 1.0, 3)
     for k in range(int(rng.integers(1, 8))):
         center = u(-0.32, 0.32, 3) * stretch if k else np.zeros(3)
-        f.ball(
-            center,
-            u(0.1, 0.28) * np.exp(rng.normal(0, 0.25, 3)).clip(0.6, 1.6) if k else 0.42 * stretch,
-            blend=u(0.02, 0.15),
-            label=int(k > 2),
-        )
+        radii = u(0.1, 0.28) * np.exp(rng.normal(0, 0.25, 3)).clip(0.6, 1.6) if k else 0.42 * stretch
+        f.ball(center, radii, blend=u(0.02, 0.15), label=int(k > 2))
     f.ripple(rng, u(0, 0.05), u(0.25, 0.8))
     if rng.random() < 0.4:
         f.ripple(rng, u(0.003, 0.015), u(0.08, 0.2))

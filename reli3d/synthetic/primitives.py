@@ -29,14 +29,13 @@ def box(size: Sequence[float] | np.ndarray, bevel: float = 0.0) -> Manifold:
     return Manifold.hull_points(np.ascontiguousarray(points.reshape(-1, 3)))
 
 
-def lathe(profile: np.ndarray, segments: int = 32, degrees: float = 360.0) -> Manifold:
+def lathe(profile: np.ndarray, segments: int = 32) -> Manifold:
     """Body of revolution about +Y of a closed polygon ``(K, 2)`` of radius and height, in either orientation."""
-    x, y = np.asarray(profile, dtype=float).T
     ring = np.asarray(profile, dtype=float)
+    x, y = ring.T
     if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) < 0:
         ring = ring[::-1]
-    section = CrossSection([np.ascontiguousarray(ring)])
-    return section.revolve(segments, degrees).rotate(Y_UP)
+    return CrossSection([np.ascontiguousarray(ring)]).revolve(segments).rotate(Y_UP)
 
 
 def solid_of_profile(radius: np.ndarray, height: np.ndarray, segments: int = 32) -> Manifold:
@@ -65,11 +64,8 @@ def ellipsoid(radii: Sequence[float] | np.ndarray, segments: int = 32) -> Manifo
 
 def capsule(start: Sequence[float], end: Sequence[float], radius: float, *, tip: float | None = None) -> Manifold:
     """Convex hull of two balls, of ``radius`` at ``start`` and ``tip`` (default the same) at ``end``."""
-    ends = [
-        Manifold.sphere(r, 20).translate(tuple(map(float, p)))
-        for p, r in ((start, radius), (end, radius if tip is None else tip))
-    ]
-    return Manifold.batch_hull(ends)
+    ends = (start, radius), (end, radius if tip is None else tip)
+    return Manifold.batch_hull([Manifold.sphere(r, 20).translate(tuple(map(float, p))) for p, r in ends])
 
 
 def torus(ring: float, tube: float, *, segments: int = 40) -> Manifold:
@@ -102,16 +98,12 @@ def wedge(size: Sequence[float], ridge: float, shift: float = 0.0) -> Manifold:
 
 
 def tube(
-    path: np.ndarray,
-    radius: np.ndarray | float,
-    *,
-    closed: bool = False,
-    segments: int = 12,
+    path: np.ndarray | Sequence, radius: np.ndarray | float, *, closed: bool = False, segments: int = 12
 ) -> Manifold:
     """Sweeps a circle along ``path (K, 3)`` with ``radius`` at each point.
 
-    Frames are rotation minimizing (parallel transport, Hanson and Ma
-    1995); along a closed path the residual rotation is distributed evenly.
+    Frames are rotation minimizing (parallel transport, Hanson and Ma 1995); along a closed path the residual rotation
+    is distributed evenly.
     """
     path = np.asarray(path, dtype=float)
     count = len(path)
@@ -157,17 +149,15 @@ def _carry(vector: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndar
 
 def from_arrays(vertices: np.ndarray, faces: np.ndarray) -> Manifold:
     """Solid of a closed, outward oriented triangle mesh ``(V, 3)``, ``(F, 3)``; empty if the mesh is not closed."""
-    return Manifold(
-        Mesh(np.ascontiguousarray(vertices, dtype=np.float32), np.ascontiguousarray(faces, dtype=np.uint32))
-    )
+    vertices = np.ascontiguousarray(vertices, dtype=np.float32)
+    return Manifold(Mesh(vertices, np.ascontiguousarray(faces, dtype=np.uint32)))
 
 
-def curve(points: np.ndarray, count: int, *, closed: bool = False) -> np.ndarray:
+def curve(points: np.ndarray | Sequence, count: int, *, closed: bool = False) -> np.ndarray:
     """``count`` points of the uniform Catmull-Rom spline through ``points`` ``(K, D)``."""
     p = np.asarray(points, dtype=float)
-    ext = (
-        np.concatenate([p[-1:], p, p[:2]]) if closed else np.concatenate([2 * p[:1] - p[1:2], p, 2 * p[-1:] - p[-2:-1]])
-    )
+    ends = (p[-1:], p[:2]) if closed else (2 * p[:1] - p[1:2], 2 * p[-1:] - p[-2:-1])
+    ext = np.concatenate([ends[0], p, ends[1]])
     spans = len(p) if closed else len(p) - 1
     t = np.linspace(0, spans, count, endpoint=not closed)
     k = np.minimum(t.astype(int), spans - 1)

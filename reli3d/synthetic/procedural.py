@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from reli3d.geometry.camera import look_at
 from reli3d.synthetic import example, furniture, manmade, organic, vessels
-from reli3d.synthetic.assembly import Assembly
+from reli3d.synthetic.assembly import ON_BACK, ON_SIDE, Assembly
 from reli3d.synthetic.finishes import draw_materials
 from reli3d.synthetic.materials import Material, evaluate
 
@@ -95,17 +95,27 @@ def assemble(assembly: Assembly, name: str, materials: tuple[Material, ...] | No
     materials: of the parts; None draws them.
     """
     vertices, faces, part = assembly.finish(MAX_FACES)
-    low, high = vertices.min(0), vertices.max(0)
-    vertices = ((vertices - (low + high) / 2) / (high - low).max()).astype(np.float32)
+    vertices = unit_size(vertices).astype(np.float32)
     used, part = np.unique(part, return_inverse=True)
     part = part.reshape(-1).astype(np.int32)
     if materials is None:
-        corners = [vertices[faces[part == k]].reshape(-1, 3) for k in range(len(used))]
-        bounds = np.array([[points.min(0), points.max(0)] for points in corners])
-        materials = draw_materials(assembly.rng, [assembly.roles[k] for k in used], bounds)
+        roles = [assembly.roles[k] for k in used]
+        materials = draw_materials(assembly.rng, roles, part_bounds(vertices, faces, part))
     else:
         materials = tuple(materials[k] for k in used)
     return ProceduralObject(vertices, faces, corner_normals(vertices, faces), part, materials, name)
+
+
+def unit_size(vertices: np.ndarray) -> np.ndarray:
+    """``vertices (V, 3)`` centered, with the longest side of their box 1."""
+    low, high = vertices.min(0), vertices.max(0)
+    return (vertices - (low + high) / 2) / (high - low).max()
+
+
+def part_bounds(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Lowest and highest corner of the box of every part, ``(P, 2, 3)``."""
+    corners = [vertices[faces[part == k]].reshape(-1, 3) for k in range(part.max() + 1)]
+    return np.array([[points.min(0), points.max(0)] for points in corners])
 
 
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = CREASE_DEG) -> np.ndarray:
@@ -126,8 +136,7 @@ def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = 
     key, mirrored = start * last + end, end * last + start
     order = np.argsort(key)
     opposite = order[np.minimum(np.searchsorted(key[order], mirrored), len(order) - 1)]  # half-edge on the other side
-    half = np.arange(3 * count)
-    found = key[order[np.minimum(np.searchsorted(key[order], mirrored), len(order) - 1)]] == mirrored
+    half, found = np.arange(3 * count), key[opposite] == mirrored
     smooth = (normal[half // 3] * normal[opposite // 3]).sum(-1) > np.cos(np.radians(crease_deg))
     # a half-edge connects the corner at its start with the adjacent corner of the opposite face; slivers are smooth
     smooth |= (area[half // 3] < 1e-12) | (area[opposite // 3] < 1e-12)
@@ -175,14 +184,15 @@ def _pose(a: Assembly) -> None:
     """Random yaw, a multiple of 90 degrees with probability 1/2; with probability 0.06 also lying on a side."""
     rng = a.rng
     if rng.random() < 0.06:
-        a.transform(
-            np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]])
-            if rng.random() < 0.5
-            else np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
-        )
+        a.transform(ON_BACK if rng.random() < 0.5 else ON_SIDE)
     yaw = rng.uniform(0, 2 * np.pi) if rng.random() < 0.5 else np.pi / 2 * rng.choice(4, p=[0.55, 0.15, 0.15, 0.15])
-    c, s = np.cos(yaw), np.sin(yaw)
-    a.transform(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]))
+    a.transform(yaw_matrix(yaw))
+
+
+def yaw_matrix(angle: float) -> np.ndarray:
+    """Rotation ``(3, 3)`` about +Y by ``angle`` radians."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
 def sample_cameras(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,14 @@ from torch import Tensor
 from reli3d.errors import InputError
 from reli3d.io.glb import read_glb
 from reli3d.synthetic.finishes import draw_materials
-from reli3d.synthetic.procedural import CREASE_DEG, ProceduralObject, corner_normals
+from reli3d.synthetic.procedural import (
+    CREASE_DEG,
+    ProceduralObject,
+    corner_normals,
+    part_bounds,
+    unit_size,
+    yaw_matrix,
+)
 from reli3d.synthetic.samples import ObjectSurface
 from reli3d.synthetic.scanned import outside_distance
 
@@ -50,7 +57,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         owners.append(np.full(len(faces[-1]), k))
         start += len(vertices[-1])
     v, f, part = np.concatenate(vertices).astype(np.float64), np.concatenate(faces), np.concatenate(owners)
-    v = (v - (v.min(0) + v.max(0)) / 2) / np.ptp(v, axis=0).max()
+    v = unit_size(v)
     _, first, index = np.unique(np.round(v * 1e5).astype(np.int64), axis=0, return_index=True, return_inverse=True)
     f = index.reshape(-1)[f]
     keep = (f[:, 0] != f[:, 1]) & (f[:, 1] != f[:, 2]) & (f[:, 2] != f[:, 0])
@@ -70,7 +77,7 @@ def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject
             v, f, p = rounded(v, f, p, int(rng.integers(1, 3)), float(rng.uniform(0.2, 1.0)))
         v = v * np.exp(rng.normal(0, STRETCH_SIGMA, 3))
         yaw = rng.uniform(0, 2 * np.pi) if rng.random() < 0.5 else np.pi / 2 * rng.integers(4)
-        turn = _yaw(yaw)
+        turn = yaw_matrix(yaw)
         if rng.random() < 0.12:
             turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
             turn[:, 0] *= np.sign(np.linalg.det(turn))
@@ -92,13 +99,11 @@ def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject
     if len(f) > MAX_FACES:
         names = ", ".join(str(path) for path in paths)
         raise InputError("--shapes", f"expected at most {MAX_FACES} faces of {names}, got {len(f)}; decimate them")
-    v = ((v - (v.min(0) + v.max(0)) / 2) / np.ptp(v, axis=0).max()).astype(np.float32)
+    v = unit_size(v).astype(np.float32)
     used, part = np.unique(part, return_inverse=True)
     part = part.reshape(-1).astype(np.int32)
-    corners = [v[f[part == k]].reshape(-1, 3) for k in range(len(used))]
-    bounds = np.array([[c.min(0), c.max(0)] for c in corners])
     roles = [str(rng.choice(ROLES)) for _ in used]
-    materials = draw_materials(rng, roles, bounds)
+    materials = draw_materials(rng, roles, part_bounds(v, f, part))
     crease = CREASE_DEG if rng.random() < 0.7 else float(rng.choice([10.0, 60.0]))
     f = f.astype(np.int32)
     return ProceduralObject(v, f, corner_normals(v, f, crease), part, materials, "shape")
@@ -123,8 +128,3 @@ def rounded(v: np.ndarray, f: np.ndarray, part: np.ndarray, times: int, strength
         for _ in range(2):
             v = v + 0.5 * strength * (graph @ v / degree - v)
     return v, f, part
-
-
-def _yaw(angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])

@@ -22,14 +22,12 @@ def vessel(a: Assembly) -> None:
     fine[:, 0] = fine[:, 0].clip(0.06)
     fine[:, 1] = np.maximum.accumulate(fine[:, 1].clip(0, height) + np.arange(len(fine)) * 1e-6)
     segments = int(rng.choice([6, 8, 12, 32, 40, 48], p=[0.04, 0.05, 0.04, 0.27, 0.3, 0.3]))
-    body = a.part(
-        str(rng.choice(["ceramic", "metal", "plastic", "wood", "paint", "stone"], p=[0.4, 0.15, 0.15, 0.1, 0.1, 0.1]))
-    )
+    body = a.random_part("ceramic", "metal", "plastic", "wood", "paint", "stone", p=[0.4, 0.15, 0.15, 0.1, 0.1, 0.1])
     a.add(p.solid_of_profile(fine[:, 0], fine[:, 1], segments), body)
     wide = fine[:, 0].max()
     if rng.random() < 0.3:
         where = fine[int(rng.integers(1, len(fine) - 1))]
-        band = a.part(str(rng.choice(["accent", "metal"])))
+        band = a.random_part("accent", "metal")
         a.add(p.torus(where[0], wide * u(0.02, 0.06), segments=segments), band, (0, where[1], 0))
     hollow = rng.random() < 0.6
     if hollow:
@@ -48,31 +46,27 @@ def vessel(a: Assembly) -> None:
         at = lambda y: float(np.interp(y, fine[:, 1], fine[:, 0]))  # noqa: E731
         out = wide + u(0.12, 0.5)
         path = p.curve(
-            np.array(
-                [
-                    [at(low) * 0.96, low],
-                    [(out + at(low)) / 2, low - 0.02],
-                    [out, (low + high) / 2],
-                    [(out + at(high)) / 2, high + 0.03],
-                    [at(high) * 0.96, high],
-                ]
-            ),
+            [
+                [at(low) * 0.96, low],
+                [(out + at(low)) / 2, low - 0.02],
+                [out, (low + high) / 2],
+                [(out + at(high)) / 2, high + 0.03],
+                [at(high) * 0.96, high],
+            ],
             20,
         )
         thick = u(0.03, 0.075) * max(wide, 0.5)
         grip = p.tube(np.concatenate([path, np.zeros((20, 1))], 1), thick, segments=10).scale((1, 1, u(0.8, 1.8)))
-        handle = body if rng.random() < 0.6 else a.part(str(rng.choice(["wood", "metal", "plastic"])))
+        handle = body if rng.random() < 0.6 else a.random_part("wood", "metal", "plastic")
         keep = grip - p.solid_of_profile(fine[:, 0] * 0.93, fine[:, 1], 32)
         a.copy_turned(keep, handle, handles)
         if handles == 1 and rng.random() < 0.5:  # a spout on the other side
             y = u(0.3, 0.6) * height
             tip = -(wide + u(0.2, 0.5)), height * u(0.85, 1.05)
-            line = p.curve(
-                np.array([[-at(y) * 0.85, y, 0], [-(at(y) + wide) * 0.62, y + 0.1 * height, 0], [*tip, 0]]), 14
-            )
+            line = p.curve([[-at(y) * 0.85, y, 0], [-(at(y) + wide) * 0.62, y + 0.1 * height, 0], [*tip, 0]], 14)
             a.add(p.tube(line, np.linspace(0.2, 0.07, 14) * wide), body)
     if rng.random() < 0.2:
-        foot = a.part(str(rng.choice(["wood", "metal", "stone"])))
+        foot = a.random_part("wood", "metal", "stone")
         a.add(p.cylinder(fine[0, 0] * u(1.05, 1.5), u(0.04, 0.15), bevel=0.02, segments=segments), foot)
 
 
@@ -80,7 +74,7 @@ def _lid(a: Assembly, radius: float, height: float, segments: int) -> None:
     rng, u = a.rng, a.rng.uniform
     if rng.random() < 0.3:
         return
-    lid = a.part(str(rng.choice(["accent", "metal", "wood", "plastic"])))
+    lid = a.random_part("accent", "metal", "wood", "plastic")
     if rng.random() < 0.6:  # screw cap or cork
         tall = radius * u(0.4, 1.4)
         a.add(
@@ -98,7 +92,7 @@ def lamp(a: Assembly) -> None:
     rng, u = a.rng, a.rng.uniform
     frame = a.part("metal" if rng.random() < 0.6 else "paint")
     if rng.random() < 0.5:
-        shade = a.part(str(rng.choice(["fabric", "paint", "ceramic"])))
+        shade = a.random_part("fabric", "paint", "ceramic")
         tall, foot = u(0.6, 1.2), u(0.2, 0.4)
         knots = p.curve(
             np.stack(
@@ -122,7 +116,7 @@ def lamp(a: Assembly) -> None:
     a.add(p.cylinder(radius * 1.0, u(0.1, 0.3), top=radius * u(0.2, 0.5), segments=sides), frame, (0, tall + 0.12, 0))
     posts = max(sides, 4) if sides < 32 else int(rng.integers(4, 9))
     a.copy_turned(p.cylinder(0.022, tall, segments=8).translate((radius, tall / 2, 0)), frame, posts)
-    glass = a.part(str(rng.choice(["ceramic", "accent", "paint"])))
+    glass = a.random_part("ceramic", "accent", "paint")
     a.add(
         p.cylinder(radius * u(0.55, 0.9), tall, segments=32 if rng.random() < 0.5 else sides), glass, (0, tall / 2, 0)
     )
@@ -135,8 +129,8 @@ def lamp(a: Assembly) -> None:
 def container(a: Assembly) -> None:
     """Crate, chest, barrel, basket, bucket, suitcase or box with frames, hoops and handles."""
     rng, u = a.rng, a.rng.uniform
-    body = a.part(str(rng.choice(["wood", "paint", "plastic", "metal"], p=[0.4, 0.25, 0.2, 0.15])))
-    frame = a.part(str(rng.choice(["metal", "wood", "accent"])))
+    body = a.random_part("wood", "paint", "plastic", "metal", p=[0.4, 0.25, 0.2, 0.15])
+    frame = a.random_part("metal", "wood", "accent")
     kind = rng.random()
     if kind < 0.35:  # barrel, drum, tin
         tall, bulge = u(0.8, 1.8), u(-0.02, 0.18)
