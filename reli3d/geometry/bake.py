@@ -201,7 +201,7 @@ def bake(
     texels from the nearest covered one; if False, they are 0.
 
     No gradient.  Raises TypeError for a wrong type or dtype; ValueError without ``uv``, if the surface covers no texel,
-    or if ``fn`` returns a wrong shape or a varying number of channels.
+    or if ``fn`` returns a wrong shape, or varying names or numbers of channels.
 
     >>> maps = reli3d.bake(mesh, 64, lambda position, normal: 0.5 + 0.5 * normal)
     >>> textures = reli3d.TextureSet(maps["value"], roughness=0.5, metallic=0.0)
@@ -225,7 +225,10 @@ def bake(
             if values is not None:
                 arguments = (*arguments, _values(mesh, values, places, part))
             found = fn(*arguments)
-            for name, value in ({"value": found} if isinstance(found, Tensor) else found).items():
+            found = {"value": found} if isinstance(found, Tensor) else found
+            if maps and found.keys() != maps.keys():
+                raise ValueError(f"fn(): expected {', '.join(maps)} as before, got {', '.join(found)}")
+            for name, value in found.items():
                 check(f"fn()[{name!r}]", value, like=texels.bary)
                 if value.ndim != 2 or len(value) != len(part):
                     raise ValueError(f"fn()[{name!r}]: expected shape ({len(part)}, C), got {tuple(value.shape)}")

@@ -204,6 +204,9 @@ def test_faults_are_named(sphere):
         bake(Mesh(sphere.vertices, sphere.faces, uv=sphere.uv + 3.0), 16, lambda p, n: p)
     with pytest.raises(ValueError, match=r"fn\(\)\['value'\]: expected shape"):
         bake(sphere, 16, lambda p, n: p[:1])
+    names = iter(("base", "base", "other"))
+    with pytest.raises(ValueError, match=r"fn\(\): expected base as before, got other"):
+        bake(sphere, 16, lambda p, n: {next(names): p}, chunk=64)
     with pytest.raises(ValueError, match="chunk"):
         bake(sphere, 16, lambda p, n: p, chunk=0)
     with pytest.raises(ValueError, match=r"maps: expected shape \(4, 4, 'C'\)"):
