@@ -40,7 +40,7 @@ SAME_UP = math.cos(math.radians(15.0))  # between the upward directions of views
 OUTLIER_AGREEMENT = 0.8  # of the median: a view whose mask the hull fills less is left out
 SIDE_ELEVATION = 45.0  # degrees up to which a direction looks at a side of the object
 LEAST_REGISTERED, MOST_ERROR, WIDEST_GAP = 0.8, 1.0, 60.0
-LEAST_POINTS, LEAST_AGREEMENT, LEAST_MASK = 200, 0.85, 0.03
+LEAST_POINTS, LEAST_AGREEMENT, LEAST_MASK, LEAST_FIT = 200, 0.85, 0.03, 0.8
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,7 @@ class CaptureReport:
     object_points: int = 0
     gap: float = 0.0  # degrees, the widest between cameras around the object
     agreement: float = 0.0  # median fraction of a mask that the visual hull fills
+    epipolar_fit: float = 1.0  # matches on the object that fit the cameras, over those that fit pairs of views
     mask_fraction: float = 0.0  # median fraction of an image that the mask covers
     mask_method: str = ""
     plane: bool = False
@@ -128,6 +129,7 @@ def capture(
             f"{len(photos)} ({len(first.views)} registered); give --masks, or take sharper images nearer to it",
         )
     final, up, ground = _refined(segmented, scene, known, report, progress)
+    report.epipolar_fit = round(report.epipolar_fit, 3)
     report.registered = len(final.found.views)
     registered = {v.photo.name for v in final.found.views}
     report.lost = [p.name for p in photos if p.name not in registered]
@@ -241,33 +243,38 @@ def _refined(
     """The map in whose frame the object does not move, with its masks; the upward direction ``(3,)`` and the ground's
     height along it (None: unknown) in that frame.
 
-    Where matches inside the masks do not fit the map's cameras, the object was moved relative to its surroundings, and
-    the features inside the masks are mapped alone.  Matches outside, if they fit, know the lenses better, and the
-    cameras of each group of views between which the object stayed in its place.
+    Where matches inside the masks do not fit the map's cameras, or the masks disagree, the features inside the masks
+    are mapped alone.  If their matches do not fit the first map's cameras, the object was moved relative to its
+    surroundings.  The first map, if matches outside fit it, still has the better lenses, and the better cameras within
+    each group of views between which the object stayed in its place.  Otherwise masks that disagree are fused.
     """
     first = segmented.found
     up = scene.plane.normal if scene.plane else _mean_up(first)
     ground = -scene.plane.offset if scene.plane else None
-    before = epipolar_fit(first, segmented.masks)
-    if before >= RIGID_FIT:
-        if known is None and scene.plane and _agreement(segmented.views, segmented.masks) < SURE_AGREEMENT:
-            segmented = _Segmented(first, fused_masks(first, scene, segmented.masks))
+    report.epipolar_fit = epipolar_fit(first, segmented.masks)
+    consistent = _agreement(segmented.views, segmented.masks) > SURE_AGREEMENT
+    if report.epipolar_fit >= RIGID_FIT and consistent:
         return segmented, up, ground
+    views, by_name = segmented.views, {v.photo.name: v for v in first.views}
     lenses = first if epipolar_fit(first, segmented.masks, inside=False) >= RIGID_FIT else None
-    views = segmented.views
     try:
         second = map_photos([v.photo for v in views], progress, [segmented.masks[v.photo.name] for v in views], lenses)
     except InputError:
         second = None
+    if second:  # whose features, with a lower contrast threshold, link more views of the object
+        same = replace(second, views=tuple(by_name[v.photo.name] for v in second.views))
+        report.epipolar_fit = min(report.epipolar_fit, epipolar_fit(same, segmented.masks))
     if (
         second is None
         or len(second.views) < KEPT_FRACTION * len(first.views)
-        or epipolar_fit(second, segmented.masks) <= before
+        or report.epipolar_fit >= RIGID_FIT
+        or (after := epipolar_fit(second, segmented.masks)) <= report.epipolar_fit
     ):
-        report.notes.append("the object was moved relative to its surroundings: its cameras are not accurate")
+        if known is None and not consistent and report.epipolar_fit >= RIGID_FIT:
+            segmented = _Segmented(first, fused_masks(first, scene, segmented.masks))
         return segmented, up, ground
+    report.epipolar_fit = after
     groups = rigid_groups(first, second) if lenses else []
-    by_name = {v.photo.name: v for v in first.views}
     if groups:
         moved = {name: group.moved(by_name[name]) for group in groups for name in group.names}
         second = replace(second, views=tuple(_posed(v, moved.get(v.photo.name)) for v in second.views))
@@ -442,6 +449,11 @@ def _check(report: CaptureReport) -> None:
         (
             report.reprojection_error < MOST_ERROR,
             f"reprojection error {report.reprojection_error} px, below 1 expected",
+        ),
+        (
+            report.epipolar_fit >= LEAST_FIT,
+            f"{100 * report.epipolar_fit:.0f} % of the matches on the object fit the cameras, at least 80 % expected: "
+            "the object was moved relative to its surroundings",
         ),
         (report.gap < WIDEST_GAP, f"no view within a sector of {report.gap:.0f} degrees, at most 60 expected"),
         (report.object_points >= LEAST_POINTS, f"{report.object_points} points on the object, at least 200 expected"),

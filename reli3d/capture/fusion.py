@@ -19,7 +19,7 @@ from reli3d.capture.masks import COARSE_SIDE, full_size, grabcut, reduced, refin
 from reli3d.capture.scene import Plane, Scene
 
 TEXEL = 1.5  # pixels at COARSE_SIDE, at the cameras' median distance
-TEXTURE_VIEWS = 16  # views, spread evenly, relative to whose median the gains of all are
+ROWS, GAIN_STEP = 64, 4  # texels: rows at a time; gains are compared at every fourth in both directions
 TEXTURE_REACH = 0.9  # of the cameras' median distance: half the side of the textured square
 FEWEST_SAMPLES = 4  # views that show a texel
 COVER_MARGIN = 0.01  # of the longer side: around the object its outline is uncertain, and texels are not taken
@@ -115,26 +115,36 @@ def _plane_texture(smalls: Sequence[_Small], inside: Sequence[np.ndarray], axes:
     cell = TEXEL * scene.distance / float(np.median([s.view.focal * s.scale for s in smalls]))
     count = int(2 * TEXTURE_REACH * scene.distance / cell)
     at = (np.arange(count) + 0.5 - count / 2) * cell
-    grid = np.stack([*np.meshgrid(at, at)], -1).reshape(-1, 2) @ axes.axes[:2] + axes.origin
-    samples = []
-    for small, mask in zip(smalls, inside, strict=True):
+    covered = []
+    for mask in inside:
         margin = 2 * round(COVER_MARGIN * max(mask.shape)) + 1
-        covered = cv2.dilate(mask.astype(np.uint8), np.ones((margin, margin), np.uint8))
+        covered.append(cv2.dilate(mask.astype(np.uint8), np.ones((margin, margin), np.uint8)))
+    coarse = _plane_samples(smalls, covered, axes, at[::GAIN_STEP], at[::GAIN_STEP])
+    reference = _median(coarse)
+    gains = np.stack([_gain(s, reference) for s in coarse])[:, None, None]
+    color, spread = np.zeros((count, count, 3), np.float32), np.zeros((count, count), np.float32)
+    for first in range(0, count, ROWS):
+        rows = slice(first, first + ROWS)
+        stack = _plane_samples(smalls, covered, axes, at, at[rows]) / gains
+        middle = _median(stack)
+        deviation = 1.4826 * _median(np.abs(stack - middle)).max(-1)
+        known = np.count_nonzero(~np.isnan(stack[..., 0]), axis=0) >= FEWEST_SAMPLES
+        color[rows] = np.nan_to_num(middle)
+        spread[rows] = np.where(known, np.maximum(deviation, LEAST_SPREAD), 10 * MOST_SPREAD)
+    return _Texture(cell, color, spread)
+
+
+def _plane_samples(smalls, covered: Sequence[np.ndarray], axes: _Axes, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Colors ``(V, len(v), len(u), 3)`` of points of the plane in each view, NaN where it does not show them."""
+    grid = np.stack([*np.meshgrid(u, v)], -1).reshape(-1, 2) @ axes.axes[:2] + axes.origin
+    samples = np.zeros((len(smalls), len(v), len(u), 3), np.float32)
+    for sample, small, cover in zip(samples, smalls, covered, strict=True):
         pixels, depth = small.project(grid)
-        x, y = (pixels.T - 0.5).astype(np.float32).reshape(2, count, count)
-        color = cv2.remap(small.image, x, y, cv2.INTER_LINEAR).astype(np.float32)
-        free = cv2.remap(1 - covered, x, y, cv2.INTER_NEAREST, borderValue=0) > 0
-        color[~free | (depth.reshape(count, count) <= 0)] = np.nan
-        samples.append(color)
-    stack = np.stack(samples)  # (V, N, N, 3)
-    reference = _median(stack[:: -(-len(stack) // TEXTURE_VIEWS)])
-    stack /= np.stack([_gain(s, reference) for s in stack])[:, None, None]
-    color = _median(stack)
-    stack -= color
-    spread = 1.4826 * _median(np.abs(stack, out=stack)).max(-1)
-    known = np.count_nonzero(~np.isnan(stack[..., 0]), axis=0) >= FEWEST_SAMPLES
-    spread = np.where(known, np.maximum(spread, LEAST_SPREAD), 10 * MOST_SPREAD).astype(np.float32)
-    return _Texture(cell, np.nan_to_num(color), spread)
+        x, y = (pixels.T - 0.5).astype(np.float32).reshape(2, len(v), len(u))
+        sample[:] = cv2.remap(small.image, x, y, cv2.INTER_LINEAR)
+        free = cv2.remap(1 - cover, x, y, cv2.INTER_NEAREST, borderValue=0) > 0
+        sample[~free | (depth.reshape(free.shape) <= 0)] = np.nan
+    return samples
 
 
 def _median(stack: np.ndarray) -> np.ndarray:
