@@ -18,7 +18,7 @@ from reli3d.capture.fusion import fused_masks
 from reli3d.capture.mapping import Map, View, map_photos
 from reli3d.capture.masks import grabcut_mask, key_mask, moving_region, touches_border
 from reli3d.capture.photos import FEWEST, PHOTO_SUFFIXES, Photo, Progress, read_photos
-from reli3d.capture.rigidity import epipolar_fit, rigid_groups
+from reli3d.capture.rigidity import Group, epipolar_fit, rigid_groups
 from reli3d.capture.scene import Scene, find_scene
 from reli3d.capture.sheet import contact_sheet
 from reli3d.errors import InputError, printable
@@ -244,9 +244,10 @@ def _refined(
     height along it (None: unknown) in that frame.
 
     Where matches inside the masks do not fit the map's cameras, or the masks disagree, the features inside the masks
-    are mapped alone.  If their matches do not fit the first map's cameras, the object was moved relative to its
-    surroundings.  The first map, if matches outside fit it, still has the better lenses, and the better cameras within
-    each group of views between which the object stayed in its place.  Otherwise masks that disagree are fused.
+    are mapped alone.  If the two maps differ by more than a similarity, and these features fit the second one better,
+    the object was moved relative to its surroundings.  The first map, if matches outside the masks fit it, still has
+    the better lenses, and the better cameras within each group of views between which the object stayed in its place.
+    Otherwise masks that disagree are fused.
     """
     first = segmented.found
     up = scene.plane.normal if scene.plane else _mean_up(first)
@@ -261,20 +262,25 @@ def _refined(
         second = map_photos([v.photo for v in views], progress, [segmented.masks[v.photo.name] for v in views], lenses)
     except InputError:
         second = None
-    if second:  # whose features, with a lower contrast threshold, link more views of the object
-        same = replace(second, views=tuple(by_name[v.photo.name] for v in second.views))
-        report.epipolar_fit = min(report.epipolar_fit, epipolar_fit(same, segmented.masks))
+    groups: list[Group] = []
+    after = 1.0
+    if second:
+        groups = rigid_groups(first, second)
+        if not groups or len(groups[0].names) < KEPT_FRACTION * len(second.views):  # the maps differ: which is right?
+            same = replace(second, views=tuple(by_name[v.photo.name] for v in second.views))
+            report.epipolar_fit = min(report.epipolar_fit, epipolar_fit(same, segmented.masks, between=groups))
+            after = epipolar_fit(second, segmented.masks, between=groups)
     if (
         second is None
         or len(second.views) < KEPT_FRACTION * len(first.views)
         or report.epipolar_fit >= RIGID_FIT
-        or (after := epipolar_fit(second, segmented.masks)) <= report.epipolar_fit
+        or after <= report.epipolar_fit
     ):
         if known is None and not consistent and report.epipolar_fit >= RIGID_FIT:
             segmented = _Segmented(first, fused_masks(first, scene, segmented.masks))
         return segmented, up, ground
     report.epipolar_fit = after
-    groups = rigid_groups(first, second) if lenses else []
+    groups = groups if lenses else []
     if groups:
         moved = {name: group.moved(by_name[name]) for group in groups for name in group.names}
         second = replace(second, views=tuple(_posed(v, moved.get(v.photo.name)) for v in second.views))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -10,25 +11,30 @@ import numpy as np
 from reli3d.capture.mapping import Map, View
 
 EPIPOLAR_ERROR = 0.002  # of the longer side: Sampson distance up to which a match fits an essential matrix
-FEWEST_MATCHES = 20  # of a pair of views
+FEWEST_MATCHES = 15  # of a pair of views
 CONFIDENCE = 0.999  # of RANSAC
 GROUP_TURN = np.cos(np.radians(3.0))  # between rotations of the views of a group
 GROUP_ERROR = 0.02  # of the distance to the middle of the cameras, of positions in a group
 SMALLEST_GROUP = 3  # views
 
 
-def epipolar_fit(found: Map, masks: dict[str, np.ndarray], *, inside: bool = True) -> float:
+def epipolar_fit(
+    found: Map, masks: dict[str, np.ndarray], *, inside: bool = True, between: Sequence[Group] | None = None
+) -> float:
     """Matches inside the masks that fit the cameras of ``found``, over those that fit one essential matrix for each
     pair of views, found by RANSAC.
 
     About 1 where the object did not move relative to what the map consists of.  Where it was moved the matches of a
     pair still fit an essential matrix of their own, but not that of the map's cameras.  inside: False takes the matches
-    outside the masks instead.  1 without matches.
+    outside the masks instead.  between: only pairs of views that are not in one of these groups.  1 without matches.
     """
+    group_of = {name: k for k, group in enumerate(between or ()) for name in group.names}
     fitting, best = 0, 0
     for a, b, pixels_a, pixels_b in found.matches:
         first, second = found.views[a], found.views[b]
         if first.photo.name not in masks or second.photo.name not in masks:
+            continue
+        if between is not None and group_of.get(first.photo.name, -1) == group_of.get(second.photo.name, -2):
             continue
         kept = (_inside(masks[first.photo.name], pixels_a) == inside) & (
             _inside(masks[second.photo.name], pixels_b) == inside

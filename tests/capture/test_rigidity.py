@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from reli3d.capture.mapping import Map, View
-from reli3d.capture.rigidity import epipolar_fit, rigid_groups
+from reli3d.capture.rigidity import Group, epipolar_fit, rigid_groups
 from tests.support.mapped import SIZE, view
 
 
@@ -41,6 +41,9 @@ def test_matches_on_a_moved_object_do_not_fit_the_cameras(moved):
     fit = epipolar_fit(found, masks)
     assert fit < 0.75 if moved else fit > 0.97  # 36 of 66 pairs are across the motion
     assert epipolar_fit(found, masks, inside=False) > 0.97
+    passes = [Group(tuple(str(k) for k in part), 1.0, np.eye(3), np.zeros(3)) for part in (range(6), range(6, 12))]
+    between = epipolar_fit(found, masks, between=passes)
+    assert between < 0.5 if moved else between > 0.97
 
 
 def test_groups_of_views_have_the_motions_of_the_object():
