@@ -16,7 +16,7 @@ from PIL import Image
 
 from reli3d.capture.fusion import fused_masks
 from reli3d.capture.mapping import Map, View, map_photos
-from reli3d.capture.masks import grabcut_mask, key_mask, moving_region, touches_border
+from reli3d.capture.masks import grabcut_mask, is_empty, key_mask, moving_region, touches_border
 from reli3d.capture.photos import FEWEST, PHOTO_SUFFIXES, Photo, Progress, read_photos
 from reli3d.capture.rigidity import Group, epipolar_fit, rigid_groups
 from reli3d.capture.scene import Scene, find_scene
@@ -188,7 +188,7 @@ def _known_masks(photos: Sequence[Photo], options: CaptureOptions, progress: Pro
             mask = np.asarray(remover.mask(Image.fromarray(photo.pixels)))
         else:
             mask = key_mask(photo.pixels)
-        if mask is not None:
+        if mask is not None and not is_empty(mask):
             found[photo.name] = mask
     if len(found) < FEWEST:
         where, what = "mask-method", "images of one object before a uniform background"
@@ -231,7 +231,7 @@ def _masks(
         progress("masks", k, len(found.views))
         seeds = None if support is None else support.get(view.photo.name, np.zeros((0, 2)))
         mask = grabcut_mask(view, found, scene, seeds)
-        if mask is not None:
+        if mask is not None and not is_empty(mask):
             masks[view.photo.name] = mask
     progress("masks", len(found.views), len(found.views))
     return masks
@@ -277,7 +277,8 @@ def _refined(
         or after <= report.epipolar_fit
     ):
         if known is None and not consistent and report.epipolar_fit >= RIGID_FIT:
-            segmented = _Segmented(first, fused_masks(first, scene, segmented.masks))
+            fused = fused_masks(first, scene, segmented.masks)
+            segmented = _Segmented(first, {name: mask for name, mask in fused.items() if not is_empty(mask)})
         return segmented, up, ground
     report.epipolar_fit = after
     groups = groups if lenses else []

@@ -18,6 +18,7 @@ CONTEXT = 0.25  # of the outer limit's size: background around it that the color
 ROUNDS = 5  # of GrabCut
 FEWEST_SEEDS = 6  # keypoints of the object: fewer do not show its colors
 HOLE = 0.002  # of the mask's area: smaller holes and islands are noise
+LEAST_COVERED = 0.0005  # fraction of an image, below which a mask shows no object
 REGION_SIDE = 160  # pixels along the width at which images of a turntable are compared
 STILL = 3.0  # of 255: standard deviation between images up to which a pixel does not change: noise and JPEG
 LEAST_STILL = 0.1  # fraction of such pixels from which the camera is fixed; hand-held images have none
@@ -171,6 +172,11 @@ def moving_region(pixels: list[np.ndarray], *, fixed: bool = False) -> np.ndarra
     moving = (spread > max(6.0, 3.0 * noise)).astype(np.uint8) * 255
     moving = cleaned(cv2.morphologyEx(moving, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)), None)
     return cv2.resize(moving, pixels[0].shape[1::-1], interpolation=cv2.INTER_NEAREST)
+
+
+def is_empty(mask: np.ndarray) -> bool:
+    """Whether less than LEAST_COVERED of the mask is inside."""
+    return bool((mask > 127).mean() < LEAST_COVERED)
 
 
 def touches_border(mask: np.ndarray) -> bool:

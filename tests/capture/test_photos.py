@@ -89,6 +89,11 @@ def test_masks_are_found_by_name_before_the_mapping(tmp_path):
     Image.new("L", (320, 240)).save(masks / "0.png")
     with pytest.raises(InputError, match=r"one mask of 0, got 0\.jpg\.png, 0\.png"):
         capture(photographs, tmp_path / "object", options)
+    (masks / "0.jpg.png").unlink()
+    for k in range(1, 8):
+        Image.new("L", (320, 240)).save(masks / f"{k}.png")  # black: the object is in none of the images
+    with pytest.raises(InputError, match="at least 8 of 8, got 0"):
+        capture(photographs, tmp_path / "object", options)
     assert not (tmp_path / "object").exists()
 
 
