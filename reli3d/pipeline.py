@@ -69,15 +69,9 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False) -> F
     """
     batch = prepared.batch
     if isinstance(model, LocalReconstructor):
-        return model.encode_for_inference(
-            batch.images,
-            batch.masks,
-            batch.c2w,
-            batch.intrinsics,
-            prepared.images,
-            prepared.camera.intrinsics,
-            mirrored=prepared.mirrored,
-        )
+        views = batch.images, batch.masks, batch.c2w, batch.intrinsics
+        detail = prepared.images, prepared.camera.intrinsics
+        return model.encode_for_inference(*views, *detail, mirrored=prepared.mirrored)
     shown = torch.tensor([background], device=batch.images.device, dtype=torch.bool)
     code = model.encode(
         batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None], background_visible=shown
@@ -227,9 +221,8 @@ def transform_asset(asset: Asset, similarity: Similarity) -> Asset:
     tangents = torch.cat([tangents[:, :3] @ rotation.T, tangents[:, 3:]], -1)
     moved = replace(mesh, vertices=similarity.apply(mesh.vertices), normals=normals @ rotation.T, tangents=tangents)
     environment = asset.environment
-    if environment is not None and not torch.equal(
-        rotation, torch.eye(3, dtype=torch.float32, device="cpu").to(rotation)
-    ):
+    identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+    if environment is not None and not torch.equal(rotation, identity):
         rows = environment.radiance.shape[0]
         environment = Environment(environment.lookup((lat_long_directions(rows).to(rotation) @ rotation).contiguous()))
     return replace(asset, mesh=moved, environment=environment)

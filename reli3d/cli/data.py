@@ -18,10 +18,7 @@ COUNT, VIEWS = 1000, 6  # default numbers of seeds and views
 
 
 def parser() -> argparse.ArgumentParser:
-    whole = Parser(
-        prog="reli3d-data",
-        description="Render training samples, and pack objects into shards.",
-    )
+    whole = Parser(prog="reli3d-data", description="Render training samples, and pack objects into shards.")
     actions = whole.add_subparsers(dest="action", required=True, metavar="ACTION")
     about = "render training samples of procedural objects or textured meshes"
     p = actions.add_parser("render", help=about, description=f"{about.capitalize()}.")
@@ -43,9 +40,7 @@ def parser() -> argparse.ArgumentParser:
         "metallic-roughness texture 30 views, with images, cameras and environment only",
     )
     p.add_argument(
-        "--held-out",
-        choices=("validation", "test"),
-        help="objects of the validation or test set, under held-out maps",
+        "--held-out", choices=("validation", "test"), help="objects of the validation or test set, under held-out maps"
     )
     p.add_argument("--meshes", type=Path, nargs="+", help="GLB files or folders of them, instead of procedural objects")
     p.add_argument(

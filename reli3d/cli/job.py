@@ -41,12 +41,7 @@ class FolderJob:
 
     def __init__(self, args: argparse.Namespace, device: str, budget: dict[str, float | int]):
         self.options = ReconstructOptions(
-            args.texture_size,
-            args.resolution,
-            args.normalize,
-            args.up,
-            hero=args.hero,
-            background=args.background,
+            args.texture_size, args.resolution, args.normalize, args.up, hero=args.hero, background=args.background
         )
         self.reading = FolderOptions(
             args.views, args.masks, args.remove_background, budget, args.refine_cameras, interrupt_flag, args.light

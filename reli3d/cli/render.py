@@ -271,9 +271,8 @@ def _animate(path: Path, images: list, kind: str) -> None:
         from reli3d.output.video import mp4_bytes
 
         return write_bytes(path, mp4_bytes(images, RATE))
-    options = (
-        {"lossless": False} if kind == "webp" else {"disposal": 2}
-    )  # disposal: clear to transparent before each frame
+    # disposal 2: clear to transparent before each frame
+    options = {"lossless": False} if kind == "webp" else {"disposal": 2}
     return _save(
         path,
         images[0],

@@ -34,7 +34,7 @@ def parser() -> argparse.ArgumentParser:
 @command("reli3d-tables")
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
-    from reli3d.eval.objects import as_csv, markdown, table
+    from reli3d.eval.objects import TableOptions, as_csv, markdown, table
     from reli3d.io.files import file_size, write_bytes
     from reli3d.io.images import write_png
     from reli3d.nn.weights import load_model
@@ -54,17 +54,9 @@ def main(argv: list[str] | None = None) -> int:
     if len(lights) < 2:
         raise InputError("--maps", "expected at least two held-out maps, got fewer; give twelve maps or more")
     model = load_model(args.weights)
-    tables, rows, sheet = table(
-        model,
-        args.objects,
-        lights,
-        args.views,
-        size=args.size,
-        hero=args.hero,
-        icp=args.icp,
-        seed=args.seed,
-        progress=lambda line: print(line, file=sys.stderr),
-    )
+    options = TableOptions(args.size, args.hero, args.icp, args.seed)
+    report = lambda line: print(line, file=sys.stderr)  # noqa: E731
+    tables, rows, sheet = table(model, args.objects, lights, args.views, options, report)
     args.output.mkdir(parents=True, exist_ok=True)
     text = markdown(tables)
     write_bytes(args.output / "table.md", text.encode())

@@ -15,12 +15,12 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from reli3d.errors import InputError
-from reli3d.geometry.camera import Camera, camera_rays
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.rays import RayScene
 from reli3d.pipeline import Network, NoSurface, ReconstructOptions, reconstruct
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
-from reli3d.render.gbuffer import surface_points
+from reli3d.render.gbuffer import primary_hits, surface_points
 from reli3d.render.latlong import quarter_turn
 from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.samples import ObjectSurface
@@ -36,29 +36,25 @@ def reference_colors(seed: int, cameras: list[Camera]) -> list[tuple[Tensor, Ten
     camera.
     """
     surface = ObjectSurface(make_object(seed))
-    out = []
-    for camera in cameras:
-        origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
-        hits = surface.scene.closest(origins, directions)
-        seen = (hits.face >= 0).nonzero()[:, 0]
-        color = torch.zeros(len(origins), 3, dtype=torch.float32, device="cpu")
-        color[seen] = linear_to_srgb(surface.points_at(hits.face[seen].long(), hits.bary[seen]).base_color.clamp(0, 1))
-        shape = (camera.height, camera.width)
-        out.append(((hits.face >= 0).reshape(shape), color.reshape(*shape, 3)))
-    return out
+    color_at = lambda face, bary: surface.points_at(face.long(), bary).base_color.clamp(0, 1)  # noqa: E731
+    return [_seen_colors(surface.scene, camera, color_at) for camera in cameras]
 
 
 def asset_colors(asset, scene: RayScene, camera: Camera) -> tuple[Tensor, Tensor]:
     """As :func:`reference_colors`, of a reconstruction in one camera."""
-    origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
-    hits = scene.closest(origins, directions)
-    seen = (hits.face >= 0).nonzero()[:, 0]
-    color = torch.zeros(len(origins), 3, dtype=torch.float32, device="cpu")
-    color[seen] = linear_to_srgb(
-        surface_points(asset.mesh, asset.textures, hits.face[seen], hits.bary[seen]).base_color
-    )
-    shape = (camera.height, camera.width)
-    return (hits.face >= 0).reshape(shape), color.reshape(*shape, 3)
+    color_at = lambda face, bary: surface_points(asset.mesh, asset.textures, face, bary).base_color  # noqa: E731
+    return _seen_colors(scene, camera, color_at)
+
+
+def _seen_colors(
+    scene: RayScene, camera: Camera, color_at: Callable[[Tensor, Tensor], Tensor]
+) -> tuple[Tensor, Tensor]:
+    """``color_at``: linear base color at faces and barycentric coordinates."""
+    hits, _, _ = primary_hits(scene, camera)
+    seen = hits.face >= 0
+    color = torch.zeros(*seen.shape, 3, dtype=torch.float32, device="cpu")
+    color[seen] = linear_to_srgb(color_at(hits.face[seen], hits.bary[seen]))
+    return seen, color
 
 
 def square_error(color: Tensor, reference: Tensor) -> float:
@@ -75,9 +71,8 @@ def scaled_square_error(color: Tensor, reference: Tensor) -> float:
 
 def light_error(predicted: Tensor, target: Tensor) -> float:
     """Mean absolute difference of log radiance over the sphere of two maps ``(H, 2H, 3)``, up to one exposure."""
-    weight = torch.sin((torch.arange(len(target), dtype=torch.float32, device="cpu") + 0.5) * torch.pi / len(target))[
-        :, None, None
-    ].expand_as(target)
+    rows = torch.arange(len(target), dtype=torch.float32, device="cpu") + 0.5
+    weight = torch.sin(rows * torch.pi / len(target))[:, None, None].expand_as(target)
     difference = torch.log(predicted + BLACK) - torch.log(target + BLACK)
     difference = difference - (difference * weight).sum() / weight.sum()
     return float((difference.abs() * weight).sum() / weight.sum())

@@ -45,6 +45,16 @@ COLUMNS = {  # the paper's groups
 
 
 @dataclass(frozen=True)
+class TableOptions:
+    """Options of :func:`table`."""
+
+    size: int = 128  # pixels per side of the views
+    hero: str = "random"  # how the reference view is chosen, ``random`` or ``first``
+    icp: bool = False  # align the result to the reference before comparing geometry
+    seed: int = 0  # of the first object; the next has the next seed
+
+
+@dataclass(frozen=True)
 class ReferenceObject:
     """The original object with its lighting and cameras."""
 
@@ -106,14 +116,9 @@ def input_views(target: ReferenceObject, count: int, hero: int, exposure: float)
     order = [hero, *(k for k in range(count) if k != hero)]
     images, masks = [], []
     for k in order:
-        rendering = render_asset(
-            target.parts,
-            target.cameras[k],
-            target.light,
-            options=ShadeOptions(samples=SAMPLES, seed=3),
-            background="environment",
-            supersampling=2,
-        )
+        options = ShadeOptions(samples=SAMPLES, seed=3)
+        given = target.parts, target.cameras[k], target.light
+        rendering = render_asset(*given, options=options, background="environment", supersampling=2)
         images.append(linear_to_srgb((rendering.radiance * exposure).clamp(0.0, 1.0)))
         masks.append(rendering.alpha)
     cameras = [target.cameras[k] for k in order]
@@ -202,11 +207,7 @@ def table(
     files: Sequence[Path],
     lights: Sequence[Environment],
     counts: Sequence[int],
-    *,
-    size: int = 128,
-    hero: str = "random",
-    icp: bool = False,
-    seed: int = 0,
+    options: TableOptions,
     progress: Callable[[str], None] = lambda line: None,
 ) -> tuple[dict, list[dict], Tensor]:
     """Means for each number of views, the metrics of every object, and the image sheet of the last number of views.
@@ -217,9 +218,10 @@ def table(
     rows_of_images = []
     for k, path in enumerate(files):
         light, other = lights[k % len(lights)], lights[(k + 1) % len(lights)]
-        target = load_reference(path, light, other, inputs=max(counts), size=size, seed=seed + k)
+        seed = options.seed + k
+        target = load_reference(path, light, other, inputs=max(counts), size=options.size, seed=seed)
         for count in counts:
-            found, shown = evaluate(model, target, count, hero=hero, icp=icp, seed=seed + k)
+            found, shown = evaluate(model, target, count, hero=options.hero, icp=options.icp, seed=seed)
             rows.append({"object": target.name, "views": count, **found})
             progress(f"{target.name}, {count} views: " + ", ".join(f"{n} {v:.3f}" for n, v in found.items()))
         rows_of_images.append(shown)

@@ -22,9 +22,7 @@ from torch.nn.functional import normalize
 
 from reli3d._bridge import check, expect, full_precision, tensor_of
 
-DEPTH_RATIO_MIN = (
-    0.01  # least depth of points over their largest distance for their box: nearer to 0 it is rounded too much
-)
+DEPTH_RATIO_MIN = 0.01  # least depth of points over their largest distance, for their box: below, rounding dominates
 
 
 @dataclass(frozen=True)
@@ -210,9 +208,7 @@ def look_at(
     origin, aim, above = torch.broadcast_tensors(*given)
     z = normalize(origin - aim, dim=-1)
     x = torch.linalg.cross(normalize(above, dim=-1), z)
-    if (
-        origin.numel() and float(x.norm(dim=-1).min()) < 1e-6
-    ):  # sine of the angle; float32 noise of unit vectors is 1e-7
+    if origin.numel() and float(x.norm(dim=-1).min()) < 1e-6:  # sine of the angle; float32 noise is 1e-7
         raise ValueError("up: expected a direction not parallel to the view, got a parallel one")
     x = normalize(x, dim=-1)
     rows = torch.stack([x, torch.linalg.cross(z, x), z, origin], -1)

@@ -33,8 +33,7 @@ def signed_distance(vertices: Tensor, faces: Tensor, points: Tensor) -> Tensor:
     distance = points.new_empty(len(points))
     with _bridge.stream(points.device):
         mesh = wp.Mesh(
-            points=_bridge.array_of(vertices, wp.vec3),
-            indices=_bridge.array_of(faces.reshape(-1), wp.int32),
+            points=_bridge.array_of(vertices, wp.vec3), indices=_bridge.array_of(faces.reshape(-1), wp.int32)
         )
     safe = torch.where(finite[:, None], points, torch.zeros_like(points))
     reach = 4.0 * float(torch.cat([vertices, safe]).abs().max()) + 1.0  # longer than any distance that can occur

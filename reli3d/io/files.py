@@ -48,9 +48,8 @@ def write_bytes(path: str | os.PathLike, data: bytes) -> None:
 def replacing(path: str | os.PathLike):
     """Yields a temporary path in the folder of ``path``; it replaces ``path`` if the block ends without an error."""
     path = Path(path)
-    temporary = path.with_name(
-        f".{os.getpid()}.{os.urandom(4).hex()}{path.suffix[-8:]}"
-    )  # short: no file system cuts it
+    # short: no file system cuts it
+    temporary = path.with_name(f".{os.getpid()}.{os.urandom(4).hex()}{path.suffix[-8:]}")
     try:
         yield temporary
         os.replace(temporary, path)

@@ -14,15 +14,7 @@ import warp as wp
 from reli3d.kernels.bsdf import eval_bsdf, pdf_lobes
 from reli3d.kernels.envmap import direction_to_uv, lookup_envmap_uv, pdf_envmap_uv, sample_envmap
 from reli3d.kernels.math import INLINE, tangent_frame
-from reli3d.kernels.microfacet import (
-    ALPHA_MIN,
-    COS_MIN,
-    Facet,
-    facet_between,
-    ggx_root,
-    sample_ggx_vndf,
-    stretch_view,
-)
+from reli3d.kernels.microfacet import ALPHA_MIN, COS_MIN, Facet, facet_between, ggx_root, sample_ggx_vndf, stretch_view
 from reli3d.kernels.mis import mis_factor
 from reli3d.kernels.random import random_pair, rotate_point
 from reli3d.kernels.rays import hit_occluded, offset_origin

@@ -9,9 +9,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
-DEPTH_MIN = wp.constant(
-    1.0e-6
-)  # depth below which an end counts as behind the eye; its pixel would be beyond any image
+DEPTH_MIN = wp.constant(1.0e-6)  # nearer ends count as behind the eye; their pixel would be beyond any image
 
 
 @wp.func

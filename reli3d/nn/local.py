@@ -205,22 +205,11 @@ class LocalReconstructor(nn.Module):
         return self._encoded(views, mirrored, inference=False)
 
     @torch.no_grad()
-    def encode_for_inference(
-        self,
-        images: Tensor,
-        masks: Tensor,
-        c2w: Tensor,
-        intrinsics: Tensor,
-        detail: Tensor,
-        detail_intrinsics: Tensor,
-        *,
-        mirrored: int = 0,
-    ) -> LocalField:
-        """:meth:`encode` by fused kernels, equal to float32 rounding; no gradient.
+    def encode_for_inference(self, *views: Tensor, mirrored: int = 0) -> LocalField:
+        """:meth:`encode` by fused kernels, equal to float32 rounding; no gradient.  ``views``: its six tensors.
 
         The field evaluates points by fused kernels too, in blocks that fit the cache.
         """
-        views = images, masks, c2w, intrinsics, detail, detail_intrinsics
         return self._encoded(views, mirrored, inference=True)
 
     def _encoded(self, views: tuple[Tensor, ...], mirrored: int, *, inference: bool) -> LocalField:

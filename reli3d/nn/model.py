@@ -129,12 +129,7 @@ class Reconstructor(nn.Module):
         """
         return self.environment.radiance(code.latent, code.rotation, code.strength, reni_frame(directions))
 
-    def query(
-        self,
-        code: Code,
-        points: Tensor,
-        heads: Sequence[str] = tuple(HEADS),
-    ) -> dict[str, Tensor]:
+    def query(self, code: Code, points: Tensor, heads: Sequence[str] = tuple(HEADS)) -> dict[str, Tensor]:
         """Values of the named heads at points of the model's cube, ``{name: (B, N, outputs)}``, float32.
 
         points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.  ``density`` is

@@ -189,12 +189,7 @@ def locate(weights: str | os.PathLike) -> Path:
     return path
 
 
-def load_model(
-    weights: str | os.PathLike,
-    device: torch.device | str = "cpu",
-    *,
-    trunk: Trunk = None,
-) -> Network:
+def load_model(weights: str | os.PathLike, device: torch.device | str = "cpu", *, trunk: Trunk = None) -> Network:
     """The network of :func:`locate`'s file, see :func:`load`.  Raises WeightsError."""
     return load(locate(weights), trunk=trunk, device=device)[0]
 

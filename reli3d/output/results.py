@@ -134,12 +134,7 @@ def _shown(asset: Asset) -> Shown:
 
 
 def write_results(
-    replacing: Callable,
-    encoded: Encoded,
-    sheet: np.ndarray,
-    info: dict,
-    *,
-    comparison: np.ndarray | None = None,
+    replacing: Callable, encoded: Encoded, sheet: np.ndarray, info: dict, *, comparison: np.ndarray | None = None
 ) -> None:
     """Writes :data:`FILES`; on an error the folder is unchanged.  Raises OSError, ValueError.
 

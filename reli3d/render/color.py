@@ -35,9 +35,8 @@ def srgb_to_linear(value: Tensor) -> Tensor:
     >>> base_color = reli3d.srgb_to_linear(torch.full((64, 64, 3), 0.5))
     >>> textures = reli3d.TextureSet(base_color, roughness=0.5, metallic=0.0)
     """
-    power = (
-        (value.clamp(min=0.04045) + 0.055) / 1.055
-    ) ** 2.4  # the clamp keeps a NaN derivative out of the unused branch
+    # the clamp keeps a NaN derivative out of the unused branch
+    power = ((value.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(value <= 0.04045, value / 12.92, power)
 
 

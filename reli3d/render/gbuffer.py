@@ -108,12 +108,7 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
     if mesh.colors is not None:
         color = color * interpolate(mesh.colors, mesh.faces, face, bary)
     return SurfacePoints(
-        position,
-        ng,
-        tangent_normals(mesh, face, bary, normal, mapped),
-        color,
-        rough_metal[:, 0],
-        rough_metal[:, 1],
+        position, ng, tangent_normals(mesh, face, bary, normal, mapped), color, rough_metal[:, 0], rough_metal[:, 1]
     )
 
 

@@ -61,11 +61,7 @@ class Render:
         return torch.cat([self.radiance, self.alpha[..., None]], -1)
 
     def display(
-        self,
-        *,
-        exposure: float = 0.0,
-        tone: Callable[[Tensor], Tensor] = linear_to_srgb,
-        transparent: bool = True,
+        self, *, exposure: float = 0.0, tone: Callable[[Tensor], Tensor] = linear_to_srgb, transparent: bool = True
     ) -> Tensor:
         """Display values in [0, 1]: ``(H, W, 4)`` with straight alpha, or ``(H, W, 3)`` if not ``transparent``.
 

@@ -15,11 +15,7 @@ from torch import Tensor
 
 
 def lat_long_directions(
-    height: int,
-    width: int | None = None,
-    *,
-    device: torch.device | str = "cpu",
-    dtype: torch.dtype = torch.float32,
+    height: int, width: int | None = None, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
 ) -> Tensor:
     """Unit directions ``(height, width, 3)`` of the texel centers, computed in float64; default width: 2 ``height``."""
     width = 2 * height if width is None else width

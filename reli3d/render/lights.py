@@ -53,11 +53,7 @@ def sky(height: int = 64) -> Environment:
     """Clear sky over brown ground, with the sun at 40 degrees elevation, in front on the right."""
     d = lat_long_directions(height)
     y = d[..., 1:2]
-    up = torch.lerp(
-        _vector([0.75, 0.85, 1.0]),
-        _vector([0.16, 0.36, 0.85]),
-        y.clamp(min=0.0).sqrt(),
-    )
+    up = torch.lerp(_vector([0.75, 0.85, 1.0]), _vector([0.16, 0.36, 0.85]), y.clamp(min=0.0).sqrt())
     ground = _vector([0.2, 0.17, 0.13])
     light = torch.lerp(ground.expand_as(up), up, torch.sigmoid(y * height))  # the horizon fades over a texel
     sun = normalize(_vector([0.5, math.sin(math.radians(40.0)), 0.58]), dim=0)

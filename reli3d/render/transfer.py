@@ -19,9 +19,7 @@ from reli3d.geometry.topology import weld_rows
 from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 
-RAY_OFFSET_EDGES = (
-    0.05  # ray origins above the surface, in mean edge lengths: clears the facets of smooth convex surfaces
-)
+RAY_OFFSET_EDGES = 0.05  # of ray origins from the surface, in mean edge lengths: clears facets of convex surfaces
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:

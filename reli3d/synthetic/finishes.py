@@ -51,8 +51,7 @@ def color(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
     if kind == "any":
         kind = str(
             rng.choice(
-                ["gray", "white", "dark", "wood", "muted", "vivid", "earth"],
-                p=[0.17, 0.17, 0.15, 0.1, 0.2, 0.1, 0.11],
+                ["gray", "white", "dark", "wood", "muted", "vivid", "earth"], p=[0.17, 0.17, 0.15, 0.1, 0.2, 0.1, 0.11]
             )
         )
     match kind:

@@ -14,14 +14,7 @@ from torch import Tensor
 from reli3d.errors import InputError
 from reli3d.io.glb import read_glb
 from reli3d.synthetic.finishes import draw_materials
-from reli3d.synthetic.procedural import (
-    CREASE_DEG,
-    ProceduralObject,
-    corner_normals,
-    part_bounds,
-    unit_size,
-    yaw_matrix,
-)
+from reli3d.synthetic.procedural import CREASE_DEG, ProceduralObject, corner_normals, part_bounds, unit_size, yaw_matrix
 from reli3d.synthetic.samples import ObjectSurface
 from reli3d.synthetic.scanned import outside_distance
 

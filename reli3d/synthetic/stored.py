@@ -65,12 +65,7 @@ def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True
 
 
 def check_samples(
-    folder: Path,
-    name: str,
-    *,
-    views: int = 1,
-    points: bool = True,
-    also: Callable[[Path], None] = lambda path: None,
+    folder: Path, name: str, *, views: int = 1, points: bool = True, also: Callable[[Path], None] = lambda path: None
 ) -> list[Path]:
     """All sample files of ``folder``, checked.  Raises InputError if one is invalid or there is none.
 

@@ -32,10 +32,7 @@ WEIGHTS = {
     "light_scale": 0.1,
     "irradiance": 0.4,
 }
-MAX_PERTURBATION = (
-    0.02,
-    0.3,
-)  # greatest deviation of position [model's cube] and normal [radian] of an extracted surface
+MAX_PERTURBATION = 0.02, 0.3  # position [model's cube] and normal [radian] of an extracted surface deviate by so much
 GRADIENT_POINTS, GRADIENT_STEP = 384, 0.012  # surface points with a gradient loss; finite-difference step, a grid cell
 PATTERN_FLOOR = 0.002  # mean squared error added to that of a pattern: 27 dB
 DEPTH_UNIT = 0.1  # of the object's longest side

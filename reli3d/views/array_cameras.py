@@ -101,11 +101,7 @@ def decompose_projection(
     c2w = np.eye(4)
     c2w[:3, :3] = rotation.T * (1, -1, -1)  # columns y and z turned: OpenCV to OpenGL axes
     c2w[:3, 3] = -np.linalg.solve(block, projection[:, 3])
-    return (
-        (float(upper[0, 0]), float(upper[1, 1])),
-        (float(upper[0, 2]), float(upper[1, 2])),
-        c2w,
-    )
+    return ((float(upper[0, 0]), float(upper[1, 1])), (float(upper[0, 2]), float(upper[1, 2])), c2w)
 
 
 def _load(path: Path) -> np.ndarray | dict[str, np.ndarray]:

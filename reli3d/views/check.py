@@ -26,14 +26,9 @@ from reli3d.views.views import Views
 MIN_FILLED = 0.8  # fraction of every mask that the hull of right cameras fills; masks a few pixels off still reach 0.9
 SURELY_FILLED = 0.97  # mean fraction above which the cameras are accepted
 BETTER = 3.0  # an alternative is named where it leaves that many times less of the masks unfilled
-UP_MARGIN = (
-    0.1  # mean squared sine by which the up axis must be nearer to the horizon's than another: 18 degrees about it
-)
+UP_MARGIN = 0.1  # mean squared sine by which the up axis must be nearer to the horizon's than others: 18 degrees
 NEAR_AXIS = 0.94  # cosine, 20 degrees: an up direction farther from every axis cannot be corrected by --up
 INVERTED_BORDER = 0.6  # fraction of the image border inside the mask from which the mask looks inverted
-
-_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float32, device="cpu"))
-_HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float32, device="cpu"))
 
 
 @full_precision
@@ -110,19 +105,10 @@ def _filled(hull: Hull, mask: Tensor, pose: Tensor, camera: Tensor) -> float:
     return float((hit & blocks).sum() / blocks.sum().clamp_min(1))
 
 
-def _quarter_turn(views: Views, sign: float) -> Views:
-    """The views with every image rotated by 90 degrees relative to its camera."""
-    turn = torch.tensor(
-        [[0.0, sign, 0.0, 0.0], [-sign, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]],
-        dtype=torch.float32,
-        device="cpu",
-    )
-    return replace(views, c2w=views.c2w @ turn.to(views.c2w))
-
-
 def _alternatives(views: Views):
     """``(mistake, remedy, corrected views)`` of the common mistakes."""
-    c2w, flip, half = views.c2w, _FLIP.to(views.c2w), _HALF_TURN.to(views.c2w)
+    c2w = views.c2w
+    flip = c2w.new_tensor([1.0, -1.0, -1.0, 1.0])  # of the columns
     given = c2w.double()
     given[:, :3, 3] += given.new_tensor(views.origin)  # as in the folder
     inverse = torch.linalg.inv(given).to(c2w)
@@ -132,27 +118,28 @@ def _alternatives(views: Views):
         (
             "the camera axes look flipped: OpenCV (+Y down, looking along +Z) given, OpenGL expected",
             "negate the second and third column of each matrix",
-            c2w @ flip,
+            c2w * flip,
         ),
         ("the matrices look like world-to-camera", "store their inverses", inverse),
         (
             "the matrices look like world-to-camera in OpenCV axes (as COLMAP has them)",
             "store their inverses with the second and third column negated",
-            inverse @ flip,
+            inverse * flip,
         ),
         ("the rotations look transposed (world-to-camera) with camera positions", "transpose the 3x3 blocks", turned),
         (
             "the rotations look transposed and in OpenCV axes with camera positions",
             "transpose the 3x3 blocks, then negate their second and third column",
-            turned @ flip,
+            turned * flip,
         ),
-        ("the images look upside down", "turn them by 180 degrees", c2w @ half),
+        ("the images look upside down", "turn them by 180 degrees", c2w * c2w.new_tensor([-1.0, -1.0, 1.0, 1.0])),
     ]
+    for sign in (1.0, -1.0):
+        what = "the images look turned by 90 degrees (an EXIF orientation that was applied or lost?)"
+        quarter = c2w[..., [1, 0, 2, 3]] * c2w.new_tensor([-sign, sign, 1.0, 1.0])
+        cases.append((what, "store them as they were calibrated", quarter))
     for what, fix, poses in cases:
         yield what, fix, replace(views, c2w=poses)
-    what = "the images look turned by 90 degrees (an EXIF orientation that was applied or lost?)"
-    for sign in (1.0, -1.0):
-        yield what, "store them as they were calibrated", _quarter_turn(views, sign)
 
 
 def _verdict(views: Views, hull: Hull, filled: list[float]) -> str:

@@ -97,8 +97,7 @@ def check_keys(where: str, values: dict) -> None:
             word in _COEFFICIENTS and isinstance(value, list)
         ):
             raise InputError(
-                where,
-                f"{key}: expected 0 or none, as it is not read, got {shown(value)}; undistort the images first",
+                where, f"{key}: expected 0 or none, as it is not read, got {shown(value)}; undistort the images first"
             )
         elif _LENS.fullmatch(word) and not _words(value):
             raise InputError(

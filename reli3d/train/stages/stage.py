@@ -70,9 +70,8 @@ class PaperStage(Stage):
         }
         if checkpointing:
             checkpointed(model)
-        self.held_out = (
-            [self.drawn(0, k, [validation], patch=0) for k in range(VALIDATION_OBJECTS)] if validation else []
-        )
+        held_out = [validation] * VALIDATION_OBJECTS if validation else []
+        self.held_out = [self.drawn(0, k, [source], patch=0) for k, source in enumerate(held_out)]
 
     def drawn(self, step: int, place: int, sources: Sequence[Source] | None = None, patch: int | None = None) -> Draw:
         """The object at position ``place`` of the batch of ``step``; a function of the seed, the step and ``place``."""

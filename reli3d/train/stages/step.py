@@ -60,9 +60,8 @@ def renderings(
     cameras = [Camera(target.c2w[v], target.intrinsics[v], size, size) for v in range(len(target))]
     if stage.renderer == "volume":
         light, grid = lobes(model, code, stage.lobes), occupied(model, code, stage)
-        return [
-            render_volume(model, code, camera, light, grid, stage, drawn.seed + v) for v, camera in enumerate(cameras)
-        ], {}
+        seeds = range(drawn.seed, drawn.seed + len(cameras))
+        return [render_volume(model, code, c, light, grid, stage, s) for c, s in zip(cameras, seeds, strict=True)], {}
     found = surface(model, code, stage.resolution or model.preset.resolution)
     if found is None:
         return [], {"sign": seed_surface(model, code)}
