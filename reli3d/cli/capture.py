@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from reli3d.cli.exit_codes import Parser, command
-from reli3d.errors import printable
+from reli3d.errors import InputError, printable
 
 FAILED_CHECKS = 3  # exit code
 LEAST_IOU = 0.9  # of the asset's silhouettes with the masks
@@ -61,7 +61,10 @@ class _Bar:
 @command("reli3d capture")
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
-    from reli3d.capture.capture import CaptureOptions, capture, summary
+    try:
+        from reli3d.capture.capture import CaptureOptions, capture, summary
+    except ModuleNotFoundError as error:
+        raise InputError(str(error.name), "is not installed: pip install 'reli3d[capture]'") from None
 
     bar = _Bar()
     try:

@@ -43,6 +43,14 @@ def test_a_segmentation_network_that_is_not_installed_is_refused(tmp_path, capsy
     assert err.startswith("reli3d capture: mask-method: ") and "pip install 'reli3d[masks]'" in err
 
 
+def test_a_missing_extra_is_named_with_the_command_that_installs_it(tmp_path):
+    code = "import sys; sys.modules['cv2'] = None; from reli3d.cli.capture import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, str(tmp_path), str(tmp_path / "out")]
+    result = subprocess.run(command, capture_output=True, text=True)
+    err = result.stderr.strip().splitlines()[-1]
+    assert result.returncode == 2 and err == "reli3d capture: cv2: is not installed: pip install 'reli3d[capture]'"
+
+
 @pytest.mark.parametrize("code", [0, 1, 2])
 def test_the_exit_code_of_the_reconstruction_is_that_of_the_command(tmp_path, monkeypatch, capsys, code):
     report = function.CaptureReport(20, registered=20)
