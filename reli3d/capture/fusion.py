@@ -187,14 +187,15 @@ def _expected(texture: _Texture, axes: _Axes, small: _Small) -> _Expected:
 
 
 class _Colors:
-    """A mixture of Gaussians of colors ``(N, 3)``, one for each of COMPONENTS clusters."""
+    """A mixture of Gaussians of colors ``(N, 3)``, one for each of COMPONENTS clusters; of none, the least density."""
 
     def __init__(self, colors: np.ndarray) -> None:
         some = colors[np.random.default_rng(0).permutation(len(colors))[:COLOR_SAMPLES]].astype(np.float32)
         cv2.setRNGSeed(0)
         count = min(COMPONENTS, len(some))
         label = np.zeros((len(some), 1), np.int32)
-        cv2.kmeans(some, count, label, (3, 10, 1.0), 1, cv2.KMEANS_PP_CENTERS)
+        if count:
+            cv2.kmeans(some, count, label, (3, 10, 1.0), 1, cv2.KMEANS_PP_CENTERS)
         self.parts = []
         for k in range(count):
             part = some[label[:, 0] == k]

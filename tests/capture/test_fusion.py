@@ -37,7 +37,7 @@ def pictured(k: int, eye: np.ndarray, texture: np.ndarray) -> tuple[View, np.nda
     ), mask
 
 
-def test_masks_that_lack_half_of_a_gray_object_are_completed():
+def gray_scene():
     rng = np.random.default_rng(0)
     texture = cv2.resize(rng.uniform(0, 255, (100, 100, 3)).astype(np.float32), (400, 400))
     pairs = []
@@ -50,6 +50,11 @@ def test_masks_that_lack_half_of_a_gray_object_are_completed():
     points *= 0.98 * RADIUS / np.linalg.norm(points, axis=1, keepdims=True)
     found = Map(views, points, np.zeros(300), np.full(300, 3))
     scene = Scene(np.zeros(3), 2.4, Plane(np.array([0.0, 0, 1]), RADIUS), np.ones(300, bool), np.zeros(300, bool))
+    return found, scene, pairs
+
+
+def test_masks_that_lack_half_of_a_gray_object_are_completed():
+    found, scene, pairs = gray_scene()
     masks = {}
     for v, mask in pairs:
         half = mask.copy()
@@ -60,3 +65,11 @@ def test_masks_that_lack_half_of_a_gray_object_are_completed():
     assert (
         min(iou) > 0.88 and np.mean(iou) > 0.94
     )  # before the wall only the hull of the higher views shows the outline
+
+
+def test_masks_of_a_pixel_leave_no_colors_and_are_accepted():
+    found, scene, pairs = gray_scene()
+    masks = {v.photo.name: np.zeros(mask.shape, np.uint8) for v, mask in pairs}
+    for mask in masks.values():
+        mask[mask.shape[0] // 2, mask.shape[1] // 2] = 255
+    assert {k: v.shape for k, v in fused_masks(found, scene, masks).items()} == {k: v.shape for k, v in masks.items()}
