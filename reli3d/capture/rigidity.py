@@ -65,8 +65,8 @@ def _sampson(x: np.ndarray, y: np.ndarray, essential: np.ndarray) -> np.ndarray:
     """First-order distance ``(N,)`` of pairs of normalized coordinates ``(N, 2)`` from ``y^T E x = 0``."""
     x, y = (np.concatenate([p, np.ones((len(p), 1))], 1) for p in (x, y))
     line, other = x @ essential.T, y @ essential
-    slope = (line[:, :2] ** 2).sum(1) + (other[:, :2] ** 2).sum(1)
-    return np.abs((y * line).sum(1)) / np.sqrt(np.maximum(slope, 1e-30))
+    gradient = (line[:, :2] ** 2).sum(1) + (other[:, :2] ** 2).sum(1)
+    return np.abs((y * line).sum(1)) / np.sqrt(np.maximum(gradient, 1e-30))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from reli3d.fit.maps import FixedSurface
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.geometry.rays import RayScene
 from tests.support import small_scene
-from tests.support.differences import slopes
+from tests.support.differences import directional_derivatives
 
 SIZE = 40
 
@@ -89,7 +89,7 @@ def test_the_gradient_of_a_step_matches_central_differences(case, monkeypatch):
     def loss() -> Tensor:
         return shape.shape_loss(unknowns, data, weights, progress=0.9, seed=1, independent=False)
 
-    got, expected = slopes(loss, values, towards(kind, values), step)
+    got, expected = directional_derivatives(loss, values, towards(kind, values), step)
     assert got == pytest.approx(expected, rel=tolerance)
 
 
@@ -109,5 +109,5 @@ def test_the_gradient_of_the_bend_matches_central_differences(terms, monkeypatch
         weights = Weights(**{**NONE, **terms})
         return maps.maps_loss(unknowns, surface, pixels, pixels.order[:400], weights, estimate)
 
-    got, expected = slopes(loss, unknowns.bend, towards("all", unknowns.bend), 1e-3)
+    got, expected = directional_derivatives(loss, unknowns.bend, towards("all", unknowns.bend), 1e-3)
     assert got == pytest.approx(expected, rel=0.02)  # float32 sums of 400 points

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-def slopes(
+def directional_derivatives(
     loss: Callable[[], Tensor], values: Sequence[Tensor], directions: Sequence[Tensor], step: float
 ) -> tuple[float, float]:
     """The change of ``loss`` as ``values`` move along ``directions``: by its gradient, and by central differences.

@@ -18,7 +18,7 @@ from reli3d.train.stages.losses import gradients
 from reli3d.train.stages.step import object_losses, total
 from reli3d.train.stages.surface import render_surface, surface
 from reli3d.train.stages.views import Samples, draw
-from tests.support.differences import slopes
+from tests.support.differences import directional_derivatives
 from tests.support.stages import ball_model, camera, write_samples
 
 VOLUME = StageConfig("volume", "volume", 24, lobes=16, grid=8, samples_along=32)
@@ -74,7 +74,7 @@ def test_the_whole_loss_has_the_gradient_of_central_differences(case, one, monke
     def loss() -> torch.Tensor:
         return total(object_losses(model, one, stage, gradients), stage)
 
-    got, expected = slopes(loss, moved, directions, size)
+    got, expected = directional_derivatives(loss, moved, directions, size)
     assert got == pytest.approx(expected, rel=tolerance)
 
 
@@ -105,7 +105,7 @@ def test_the_weight_of_quads_moves_their_centers(one, monkeypatch):
         return (vertices * torch.randn(vertices.shape, generator=torch.Generator().manual_seed(1))).sum()
 
     row = weight[20].clone()
-    got, expected = slopes(lambda: centers(row), [row], [torch.ones(weight.shape[1])], 100.0)
+    got, expected = directional_derivatives(lambda: centers(row), [row], [torch.ones(weight.shape[1])], 100.0)
     # float32 positions summed: 1e-6, of a difference of 2e-3; gamma is far from where its sigmoid bends
     assert got == pytest.approx(expected, rel=0.02)
     assert got != 0.0
@@ -131,6 +131,6 @@ def test_the_normals_of_the_mesh_have_a_gradient_in_the_image(one):
         return (rendering.color * noise).sum() + (rendering.normal * noise.flip(0)).sum()
 
     noise = torch.randn(24, 24, 3, generator=generator)
-    got, expected = slopes(lambda: shown(normals), [normals], [direction], 1e-2)
+    got, expected = directional_derivatives(lambda: shown(normals), [normals], [direction], 1e-2)
     # float32 sums of 576 pixels; the curvature of a normalization over a step of 1e-2 is 1e-4
     assert got == pytest.approx(expected, rel=0.01)
