@@ -26,15 +26,16 @@ SLOW = [
 ]
 
 
-def mesh_of(vertices, faces) -> Mesh:
+def mesh_of(vertices, faces, device="cpu") -> Mesh:
+    """On ``device``, whatever torch's default is."""
     return Mesh(
-        torch.as_tensor(np.asarray(vertices), dtype=torch.float32).contiguous(),
-        torch.as_tensor(np.asarray(faces), dtype=torch.int32).contiguous(),
+        torch.as_tensor(np.asarray(vertices), dtype=torch.float32, device=device).contiguous(),
+        torch.as_tensor(np.asarray(faces), dtype=torch.int32, device=device).contiguous(),
     )
 
 
 def mesh_from(shape: trimesh.Trimesh, device="cpu") -> Mesh:
-    return mesh_of(shape.vertices, shape.faces).to(device)
+    return mesh_of(shape.vertices, shape.faces, device)
 
 
 def loaded(path) -> Mesh:
