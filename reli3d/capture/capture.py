@@ -301,8 +301,8 @@ def _refined(
         return refined, up, float(groups[0].apply(scene.plane.foot(scene.center)) @ up)
     pairs = [(by_name[v.photo.name], v) for v in second.views]
     directions = np.stack([b.rotation.T @ a.rotation @ up for a, b in pairs])
-    alike = directions @ directions.T > SAME_UP  # an object that was turned over has two: that of most views is up
-    upward = directions[alike[alike.sum(1).argmax()]].mean(0)
+    similar = directions @ directions.T > SAME_UP  # an object that was turned over has two: that of most views is up
+    upward = directions[similar[similar.sum(1).argmax()]].mean(0)
     return refined, upward / np.linalg.norm(upward), None
 
 

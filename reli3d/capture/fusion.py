@@ -1,6 +1,6 @@
 """Masks from all views together: what the support plane looks like, and the object's colors, fused in a volume.
 
-Where the colors of object and background are alike, one image does not show the outline.  Other views do: from above
+Where object and background have similar colors, one image does not show the outline.  Other views do: from above
 the object is in front of the plane, whose texture the views know from where it is not covered.
 """
 
@@ -243,7 +243,7 @@ def _log_odds(image: np.ndarray, inside: np.ndarray, plane: _Expected, own: _Col
 
 
 def _occupied(smalls, evidence, axes: _Axes, box, points, cells: int, growth: float) -> tuple[np.ndarray, float]:
-    """Centers ``(N, 3)``, in ``axes``, of the occupied cells that hang together with ``points``, and their size."""
+    """Centers ``(N, 3)``, in ``axes``, of the occupied cells connected to ``points``, and their size."""
     middle, side = box.mean(0), growth * float((box[1] - box[0]).max())
     middle[2] = max(middle[2], side / 2 - 0.05 * side)  # hardly any of it below the plane
     cell = side / cells

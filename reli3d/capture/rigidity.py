@@ -24,7 +24,7 @@ def epipolar_fit(
     """Matches inside the masks that fit the cameras of ``found``, over those that fit one essential matrix for each
     pair of views, found by RANSAC.
 
-    About 1 where the object did not move relative to what the map consists of.  Where it was moved the matches of a
+    About 1 where the object did not move relative to the features of the map.  Where it was moved the matches of a
     pair still fit an essential matrix of their own, but not that of the map's cameras.  inside: False takes the matches
     outside the masks instead.  between: only pairs of views that are not in one of these groups.  1 without matches.
     """
@@ -102,14 +102,14 @@ def rigid_groups(first: Map, second: Map) -> list[Group]:
         turns = np.stack([p[1].rotation.T @ p[0].rotation for p in pairs])
         limit = GROUP_ERROR * float(np.median(np.linalg.norm(b - b.mean(0), axis=1)))
         best = np.zeros(len(pairs), bool)
-        alike = (np.einsum("iab,jab->ij", turns, turns) - 1) / 2 > GROUP_TURN
+        similar = (np.einsum("iab,jab->ij", turns, turns) - 1) / 2 > GROUP_TURN
         for i in range(len(pairs)):
-            for j in alike[i].nonzero()[0]:
+            for j in similar[i].nonzero()[0]:
                 if (base := float(np.linalg.norm(a[j] - a[i]))) < 1e-9:
                     continue
                 scale = float(np.linalg.norm(b[j] - b[i])) / base
                 away = np.linalg.norm(scale * (a - a[i]) @ turns[i].T - (b - b[i]), axis=1)
-                if (fits := alike[i] & (away < 2 * limit)).sum() > best.sum():
+                if (fits := similar[i] & (away < 2 * limit)).sum() > best.sum():
                     best = fits
         if best.sum() < SMALLEST_GROUP:
             break

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from reli3d.train.muon import MOMENTUM, Muon
+from reli3d.train.muon import MOMENTUM, UPDATE_RMS, Muon
 
 
 def run(optimizer, parameter, gradients):
@@ -13,20 +13,34 @@ def run(optimizer, parameter, gradients):
     return parameter.detach()
 
 
-@pytest.mark.skipif(not hasattr(torch.optim, "Muon"), reason="torch.optim.Muon: since 2.9")
 @pytest.mark.parametrize("shape", [(16, 24), (40, 8), (16, 8, 3, 3)])
-def test_matrices_and_convolutions_follow_muon_of_torch(shape):
-    generator = torch.Generator().manual_seed(0)
-    start = torch.randn(shape, generator=generator)
-    gradients = [torch.randn(shape, generator=generator) for _ in range(4)]
-    options = {"lr": 0.02, "weight_decay": 0.1}
-    got = torch.nn.Parameter(start.clone())
-    want = torch.nn.Parameter(start.flatten(1).clone())
-    peer = torch.optim.Muon([want], momentum=MOMENTUM, adjust_lr_fn="match_rms_adamw", **options)
-    change = run(Muon([got], **options), got, gradients).flatten(1) - start.flatten(1)
-    expected = run(peer, want, gradients) - start.flatten(1)
-    assert float(expected.norm()) > 0.1
-    assert float((change - expected).norm() / expected.norm()) < 0.02  # torch's iteration is in bfloat16
+def test_the_first_step_has_the_singular_vectors_of_the_gradient(shape):
+    gradient = torch.randn(shape, generator=torch.Generator().manual_seed(3))
+    gradient[: shape[0] // 2] *= 0.05  # small singular values, which need all iterations
+    parameter = torch.nn.Parameter(torch.zeros(shape))
+    change = run(Muon([parameter], lr=1.0), parameter, [gradient]).flatten(1)
+    u, _, vt = torch.linalg.svd(gradient.flatten(1), full_matrices=False)
+    values = -u.T @ change @ vt.T / (UPDATE_RMS * max(change.shape) ** 0.5)
+    diagonal = values.diagonal()
+    assert float(diagonal.min()) > 0.65 and float(diagonal.max()) < 1.25  # Jordan's iteration ends in [0.68, 1.21]
+    assert float((values - diagonal.diag()).abs().max()) < 1e-3  # float32
+
+
+if hasattr(torch.optim, "Muon"):  # since torch 2.9
+
+    @pytest.mark.parametrize("shape", [(16, 24), (40, 8), (16, 8, 3, 3)])
+    def test_matrices_and_convolutions_follow_muon_of_torch(shape):
+        generator = torch.Generator().manual_seed(0)
+        start = torch.randn(shape, generator=generator)
+        gradients = [torch.randn(shape, generator=generator) for _ in range(4)]
+        options = {"lr": 0.02, "weight_decay": 0.1}
+        got = torch.nn.Parameter(start.clone())
+        want = torch.nn.Parameter(start.flatten(1).clone())
+        peer = torch.optim.Muon([want], momentum=MOMENTUM, adjust_lr_fn="match_rms_adamw", **options)
+        change = run(Muon([got], **options), got, gradients).flatten(1) - start.flatten(1)
+        expected = run(peer, want, gradients) - start.flatten(1)
+        assert float(expected.norm()) > 0.1
+        assert float((change - expected).norm() / expected.norm()) < 0.02  # torch's iteration is in bfloat16
 
 
 def test_vectors_small_matrices_and_fast_groups_follow_adamw():
