@@ -135,10 +135,18 @@ def full_precision(function: F) -> F:
     return cast(F, wrapper)
 
 
+def indexed(device: torch.device) -> torch.device:
+    """``device`` as tensors name it: ``cuda`` without an index is torch's current CUDA device."""
+    if device.type == "cuda" and device.index is None:
+        return torch.device("cuda", torch.cuda.current_device())
+    return device
+
+
 @contextlib.contextmanager
 def stream(device: torch.device):
     """Context in which Warp launches on torch's current CUDA stream; yields the Warp device name."""
     initialize()
+    device = indexed(device)
     if device.type == "cuda":
         with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
             yield str(wp.device_from_torch(device))
@@ -182,6 +190,7 @@ def struct_of(kind, **fields):
 
 def _check_device(args: Iterable, device: torch.device) -> None:
     """Raises ValueError for a tensor that is not on ``device``."""
+    device = indexed(device)
     for value in args:
         for tensor in (value,) if isinstance(value, Tensor) else getattr(value, "tensors", ()):
             if tensor.device != device:

@@ -298,6 +298,7 @@ def main(argv: list[str] | None = None) -> int:
     from reli3d.train.workers import Workers
 
     torch.manual_seed(getattr(args, "seed", 0))
+    workers = Workers.join()  # before the stage: it chooses the process's CUDA device
     makers = {LIGHT_PRIOR: light_prior_stage, **dict.fromkeys(SMALL_STAGES, small_stage)}
     stage = makers.get(args.stage, paper_stage)(args)
     if "export" in args:
@@ -306,7 +307,6 @@ def main(argv: list[str] | None = None) -> int:
     settings = given(args, *OF_LOOP, "shard")
     if "tensorboard" in settings:
         settings["tensorboard"] = str(settings["tensorboard"])
-    workers = Workers.join()
     train(stage, stage.options(str(args.output), **settings), workers)
     workers.leave()
     return 0

@@ -18,6 +18,7 @@ from reli3d._bridge import (
     check,
     empty,
     full_precision,
+    indexed,
     launch,
     once_differentiable,
     over_slices,
@@ -77,7 +78,7 @@ class Environment:
 
     def to(self, device: torch.device | str) -> Environment:
         """The environment on ``device``; ``self``, with its CDF, if it is already there."""
-        return self if torch.device(device) == self.radiance.device else Environment(self.radiance.to(device))
+        return self if indexed(torch.device(device)) == self.radiance.device else Environment(self.radiance.to(device))
 
     def detach(self) -> Environment:
         """The environment without gradient."""

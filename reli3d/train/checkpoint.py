@@ -66,14 +66,15 @@ def save(
     return state["average"]
 
 
-def load(path: Path, **options: Any) -> dict[str, Any]:
-    """The dictionary that :func:`save` wrote.  In files of version 0.2 ``stage`` and ``measures`` are empty.
+def load(path: Path) -> dict[str, Any]:
+    """The dictionary that :func:`save` wrote, on the CPU.
 
-    options: passed to ``torch.load``.  Raises InputError for a missing or broken file, or one of another kind.
+    In files of version 0.2 ``stage`` and ``measures`` are empty.  Raises InputError for a missing or broken file, or
+    one of another kind.
     """
     file_size(path)
     try:
-        state = torch.load(path, weights_only=True, **options)
+        state = torch.load(path, weights_only=True, map_location="cpu")
     except (pickle.UnpicklingError, *BROKEN_TORCH_FILE) as error:
         reason = shown(" ".join(str(error).split()))
         raise InputError(path, f"expected a checkpoint of reli3d-train, got a broken file ({reason})") from None

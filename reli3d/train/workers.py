@@ -24,7 +24,9 @@ class Workers:
         """Joins the process group of torchrun; a group of one process without torchrun."""
         if "RANK" not in os.environ:
             return Workers()
-        distributed.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+        if torch.cuda.is_available():
+            torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)) % torch.cuda.device_count())
+        distributed.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
         return Workers(distributed.get_rank(), distributed.get_world_size())
 
     def average(self, parameters: Sequence[Tensor], values: Tensor) -> Tensor:
@@ -35,12 +37,13 @@ class Workers:
         if self.count == 1:
             return values
         grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-        flat = torch.cat([g.reshape(-1) for g in grads] + [values])
+        device = grads[0].device if grads else values.device
+        flat = torch.cat([g.reshape(-1) for g in grads] + [values.to(device)])
         distributed.all_reduce(flat)
         flat /= self.count
         for p, part in zip(parameters, flat[: -len(values)].split([p.numel() for p in parameters]), strict=True):
             p.grad = part.view_as(p)
-        return flat[-len(values) :].clone()
+        return flat[-len(values) :].to(values.device, copy=True)
 
     def leave(self) -> None:
         """Destroys the group; with several processes also exits this one, with code 0.

@@ -258,9 +258,9 @@ def test_intersect_is_closest_with_gradients_in_rays_and_vertices(device):
     got = torch.autograd.grad(hits.t[seen].sum(), leaves)
     expected_hits = evaluate_hits(leaves[0], f, first, leaves[1], leaves[2])
     expected = torch.autograd.grad(expected_hits.t[seen].sum(), leaves)
-    assert (
-        all(torch.equal(a, b) for a, b in zip(got, expected, strict=True)) and float(got[1][~seen].abs().sum()) == 0.0
-    )
+    # on CUDA the rays of a vertex are added in any order
+    same = torch.equal if device.type == "cpu" else lambda a, b: reference.fraction_within(a, b) >= 0.999
+    assert all(same(a, b) for a, b in zip(got, expected, strict=True)) and float(got[1][~seen].abs().sum()) == 0.0
     with pytest.raises(ValueError, match="vertices: expected the positions of the scene"):
         scene.intersect(o, d, vertices=v + 1.0)
     with pytest.raises(TypeError, match="faces: expected a tensor"):
