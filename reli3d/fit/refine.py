@@ -105,11 +105,11 @@ def refine(
     bar: show progress on stderr.  interrupt: called before every step; once it returns True the fit ends with the best
     result so far.
 
-    With three or more views some are held out (:func:`held_out`): the fit uses their masks; their colors only select
-    which parts of it are kept (:func:`~reli3d.fit.choice.chosen`).  The inputs are detached: no gradient reaches them,
-    and the result has none.  Raises TypeError or ValueError if asset and views have different devices, if shapes do not
-    match, for an invalid ``light``, for a budget that is not one positive number, or if the asset lacks an environment,
-    an atlas or faces.
+    With three or more views, some are held out (:func:`held_out`).  Of these the fit uses only the masks; after the
+    fit, their colors decide which of its parts are kept (:func:`~reli3d.fit.choice.chosen`).  The inputs are detached:
+    no gradient reaches them, and the result has none.  Raises TypeError or ValueError if asset and views have different
+    devices, if shapes do not match, for an invalid ``light``, for a budget that is not one positive number, or if the
+    asset lacks an environment, an atlas or faces.
     """
     images, weights = InputImages.of(views, light), weights or losses.Weights()
     _check_asset(asset, images)

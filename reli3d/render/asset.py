@@ -86,7 +86,7 @@ class TextureSet:
         return self.base_color.shape[0]
 
     def rough_metal(self) -> Tensor:
-        """Roughness, metallic and metallic again, ``(T, T, 3)``, for one lookup of both.
+        """Map ``(T, T, 3)`` with the channels roughness, metallic, metallic: one three-channel lookup reads both maps.
 
         Cached for gradient-free maps of at most ``KEPT`` texels per side until they are modified.
         """

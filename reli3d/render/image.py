@@ -102,8 +102,8 @@ def render_asset(
     those of :func:`surface_points` and :func:`shade`.  Radiance gradients reach the textures, the environment texels,
     and the mesh's normals, tangents, colors and UV; they reach the vertices only if the mesh has no vertex normals,
     because shading then uses the face normals.  G-buffer gradients reach the textures and the mesh; depth gradients
-    also reach the camera.  ``alpha`` has no gradient: silhouettes and shadow boundaries do not contribute (see
-    :func:`antialias`).
+    also reach the camera.  ``alpha`` has no gradient.  The motion of silhouettes and shadow boundaries contributes to
+    no gradient; :func:`antialias` adds that of silhouettes.
 
     Raises TypeError for a wrong type; ValueError if neither ``environment`` nor an asset's environment is given, for an
     unknown ``background``, if ``camera`` is a batch, or for textures without ``mesh.uv``.

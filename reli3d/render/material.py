@@ -62,18 +62,19 @@ def eval_bsdf(
 
 
 def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") -> Tensor:
-    """Samples unit directions ``(..., 3)`` to the light from one lobe; density: :func:`pdf_bsdf` of the same ``lobe``.
+    """Samples one lobe of the BSDF: unit directions ``wi (..., 3)`` with the density :func:`pdf_bsdf` of that lobe.
 
     wo: ``(..., 3)`` unit, local frame, z > 0; otherwise all directions have density 0.  alpha: tensor ``(...)``, GGX
-    width ``roughness**2``.  u: ``(..., 2)`` uniform in [0, 1).  Leading axes broadcast.  lobe: ``visible`` (reflection
-    about a sampled visible normal), ``mirrored`` (reflection about this normal rotated by pi about the surface normal)
-    or ``cosine``.  Directions below the horizon, and reflections about a mirrored normal that faces away from ``wo``,
-    have value and density 0.  Two antithetic pairings exist.  (1) ``visible`` with ``u`` and with ``antithetic(u)``:
-    average the two estimates.  (2) As in ReLi3D, ``visible`` and ``mirrored`` with the same ``u``: divide each sample's
-    value times cosine by the sum of both lobes' densities at its direction, then add the two quotients.  Do not use
-    ``mirrored`` alone: it does not reach all directions.  Gradients reach ``wo`` and ``alpha``, but :func:`pdf_bsdf`
-    has none: detach the directions to differentiate a Monte Carlo estimate.  Raises TypeError unless float32,
-    ValueError for a wrong shape or device, or an unknown lobe.  Source: Dupuy and Benyoub 2023.
+    width ``roughness**2``.  u: ``(..., 2)`` uniform in [0, 1).  Leading axes broadcast.  lobe: ``visible`` (``wo``
+    reflected about a sampled visible normal), ``mirrored`` (the visible normal is first rotated by pi around the
+    surface normal; ``wo`` is reflected about the rotated normal) or ``cosine``.  Directions below the horizon, and
+    reflections about a mirrored normal that faces away from ``wo``, have value and density 0.  Two antithetic pairings
+    exist.  (1) ``visible`` with ``u`` and with ``antithetic(u)``: average the two estimates.  (2) As in ReLi3D,
+    ``visible`` and ``mirrored`` with the same ``u``: divide each sample's value times cosine by the sum of both lobes'
+    densities at its direction, then add the two quotients.  Do not use ``mirrored`` alone: it does not reach all
+    directions.  Gradients reach ``wo`` and ``alpha``, but :func:`pdf_bsdf` has none: detach the directions to
+    differentiate a Monte Carlo estimate.  Raises TypeError unless float32, ValueError for a wrong shape or device, or
+    an unknown lobe.  Source: Dupuy and Benyoub 2023.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u).detach()
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi).clamp(min=1e-12)  # 0 below the horizon, where the value is 0 too
