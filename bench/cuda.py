@@ -109,7 +109,7 @@ def compile(device) -> dict:
     return found | {"cache": str(wp.config.kernel_cache_dir)}
 
 
-def ball(preset):
+def ball(preset, device):
     """A network from scratch that shows a ball: the field of an untrained one has no surface."""
     import torch
 
@@ -124,7 +124,8 @@ def ball(preset):
             return values
 
     torch.manual_seed(0)
-    return Ball(preset)
+    with torch.device(device):  # to draw three billion parameters takes a CPU a minute
+        return Ball(preset).to(device)
 
 
 def drawn(preset, stage, device):
@@ -158,7 +159,7 @@ def stages(device) -> dict:
     cuda = device.type == "cuda"
     fits = cuda and torch.cuda.mem_get_info()[1] > 60 * 2**30  # weights, gradients and features
     for preset, of in ((TINY, config.TINY), *(((OFFICIAL, config.PAPER),) if fits else ())):
-        model = ball(preset).to(device)
+        model = ball(preset, device)
         if preset is OFFICIAL:
             checkpointed(model)
         for name, stage in of.items() if cuda else list(of.items())[:1]:
@@ -189,7 +190,7 @@ def official(device) -> dict:
     from reli3d.train.stages.surface import surface
 
     preset = OFFICIAL if device.type == "cuda" else TINY
-    model = ball(preset).to(device).to_compute(torch.bfloat16).eval()
+    model = ball(preset, device).to_compute(torch.bfloat16).eval()
     inputs, found = views(preset, 4, device), {"preset": preset.name}
     with torch.no_grad():
         for turn in ("first_s", "warm_s"):
