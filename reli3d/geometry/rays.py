@@ -30,7 +30,7 @@ class RayScene:
     mesh: a :class:`~reli3d.geometry.mesh.Mesh`, or its vertices ``(V, 3)`` float32 with ``faces (F, 3)`` int32.
     Degenerate faces are never hit; without faces every ray misses.  backend: ``embree`` (CPU, robust mode), ``warp``
     (CPU and CUDA), or ``auto``: Embree on the CPU, where it is about 3 times faster than Warp on incoherent rays, and
-    Warp on CUDA, where the BVH is built on the host.  :meth:`refit` updates moved vertices.  For vertex gradients, pass
+    Warp on CUDA.  :meth:`refit` updates moved vertices.  For vertex gradients, pass
     ``vertices`` to :meth:`intersect`.  Raises TypeError for a wrong type or dtype; ValueError for a wrong shape, an
     index out of range, non-finite vertices, or ``embree`` on CUDA.
 
@@ -192,7 +192,6 @@ class RayScene:
                 self._warp = wp.Mesh(
                     points=array_of(self.vertices, wp.vec3),
                     indices=array_of(self.faces.reshape(-1), wp.int32),
-                    bvh_constructor="sah",  # Warp's own choice on CUDA is "lbvh"
                 )
             return
         self._embree = embree.Tree(self.vertices.numpy(), self.faces.numpy())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -15,13 +17,14 @@ CACHED_FLOATS = 1 << 16  # floats of a plane that stay in a core's second-level 
 BANDS = 16  # of the rows of a plane, a CPU thread each: more copy more rows twice
 PROBED = 4096  # consecutive points tested for coherence
 STEP_TEXELS_MAX = 8.0  # distance of coherent consecutive points
+SEGMENT = 8  # cells of a row that a CUDA thread adds the points of, at least: it writes one texel beyond them
 WALK = 0.8  # fraction of coherent points from which the points are not sorted
 
 
 class _SampleTriplane(torch.autograd.Function):
     """Custom backward without atomics, which Warp lacks on CPUs and which are not deterministic on CUDA.
 
-    Points are sorted by row of cells, and each thread owns the rows of texels that it accumulates into.  On a CPU the
+    Points are sorted by row of cells, and each thread owns the texels that it accumulates into.  On a CPU the
     forward pass uses the same order, which keeps rows of large planes in the cache, and transposes channel-first rows
     to channel-last on the fly.  Coherent points (a grid, texels of an atlas) are not sorted.
     """
@@ -111,11 +114,17 @@ def _is_walk(points: Tensor, size: int) -> bool:
     return bool(near.sum() > WALK * near.numel())
 
 
+def _segments(points: Tensor, width: int) -> int:
+    """Segments of a row of cells in the adjoint: one on a CPU; on CUDA of ``SEGMENT`` cells, for more threads."""
+    return max(1, (width + 1) // SEGMENT) if points.is_cuda else 1
+
+
 def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Points of every plane ``(3 * B, N)`` int32 by row of cells, along a row roughly by column, points that miss the
-    plane last; and the start of every row and their end, ``(3 * B, height + 2)`` int32."""
-    slabs, n = points.shape[0] * 3, points.shape[1]
-    bins = 2**16 // (height + 2)
+    plane last; and the start of every segment of the rows and their end, ``(3 * B, (height + 1) * segments + 1)`` int32
+    (:func:`_segments`)."""
+    slabs, n, segments = points.shape[0] * 3, points.shape[1], _segments(points, width)
+    bins = segments * SEGMENT if points.is_cuda else 2**16 // (height + 2)
     keys = torch.empty(slabs, n, dtype=torch.int32, device=points.device)
     launch(
         kernels.cell_key_kernel,
@@ -123,11 +132,12 @@ def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tenso
         [points.view(-1, 3), sizes_of(n, height, width, 0), bins, keys.view(-1)],
         points.device,
     )
-    edges = keys.new_zeros(slabs, height + 2)
+    groups = (height + 1) * segments
+    edges = keys.new_zeros(slabs, groups + 1)
     if points.is_cuda:
         order = torch.argsort(keys, dim=1, stable=True).to(torch.int32)
-        rows = keys // bins + torch.arange(slabs, device=points.device, dtype=torch.int64)[:, None] * (height + 2)
-        count = torch.bincount(rows.view(-1), minlength=slabs * (height + 2)).view(slabs, height + 2)
+        group = keys // SEGMENT + torch.arange(slabs, device=points.device, dtype=torch.int64)[:, None] * (groups + 1)
+        count = torch.bincount(group.view(-1), minlength=slabs * (groups + 1)).view(slabs, groups + 1)
         edges[:, 1:] = count[:, :-1].cumsum(1)
         return order, edges
     order = torch.empty_like(keys)
@@ -166,16 +176,19 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
     blocks = g.shape[-1] // BLOCK_CHANNELS
     g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK_CHANNELS, device=points.device, dtype=torch.float32)
     split, sizes = 1 if points.device.type == "cpu" else blocks, sizes_of(n, height, width, blocks)
-    for parity in (0, 1):
+    segments = _segments(points, width)
+    for row_parity, parity in itertools.product((0, 1), (0, 1)):
         launch(
             kernels.planes_adjoint_kernel,
-            batch * 3 * ((height + 2 - parity) // 2) * split,
+            batch * 3 * ((height + 2 - row_parity) // 2) * ((segments + 1 - parity) // 2) * split,
             [
                 points.view(-1, 3),
                 g.view(-1, BLOCK_CHANNELS),
                 order.view(-1),
                 edges.view(-1),
                 sizes,
+                segments,
+                row_parity,
                 parity,
                 split,
                 g_planes.view(-1, BLOCK_CHANNELS),

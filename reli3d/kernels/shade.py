@@ -20,7 +20,8 @@ from reli3d.kernels.random import random_pair, rotate_point
 from reli3d.kernels.rays import hit_occluded, offset_origin
 from reli3d.kernels.sampling import mirror, opposite, reflect, sample_cosine
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
+# it traces shadow rays: see rays.py on contraction
+wp.set_module_options({"enable_backward": False, "fuse_fp": False, "cpu_compiler_flags": "-march=native " + INLINE})
 
 OPPOSITE = wp.constant(1)  # pairing of visible normals; 0 for none
 MIRRORED = wp.constant(2)

@@ -316,16 +316,19 @@ def planes_adjoint_kernel(
     order: wp.array[wp.int32],
     edges: wp.array[wp.int32],
     sizes: Sizes,
+    segments: int,
+    row_parity: int,
     parity: int,
     split: int,
     # out
     g_planes: wp.array[vec8],
 ):
-    """Gradient of the planes: a thread adds the points of one row of cells, for every ``split``-th channel block, to
-    the two adjacent rows of texels.
+    """Gradient of the planes: a thread adds the points of one segment of a row of cells, for every ``split``-th channel
+    block, to the two adjacent rows of texels.
 
-    A launch covers the rows of one ``parity``, so that no two threads write the same row of texels.  ``order``: points
-    of every plane sorted by row of cells; ``edges (P, height + 2)``: start of each row.
+    A launch covers the rows of ``row_parity`` and their segments of ``parity`` (``segments`` each, of at least 8
+    cells), so that no two threads write the same texel.  ``order``: points of every plane sorted by row and segment;
+    ``edges (P, (height + 1) * segments + 1)``: start of each segment.
     """
     i = start + wp.tid()
     height = sizes.height
@@ -333,13 +336,17 @@ def planes_adjoint_kernel(
     blocks = sizes.blocks
     first = i % split
     i = i // split
-    rows = (height + 2 - parity) // 2
-    row = (i % rows) * 2 + parity
+    across = (segments + 1 - parity) // 2
+    segment = (i % across) * 2 + parity
+    i = i // across
+    rows = (height + 2 - row_parity) // 2
+    row = (i % rows) * 2 + row_parity
     slab = i // rows  # batch * 3 + plane
     plane = slab % 3
     y = row - 1
     base = slab * height * width * blocks
-    for k in range(edges[slab * (height + 2) + row], edges[slab * (height + 2) + row + 1]):
+    at_edge = slab * ((height + 1) * segments + 1) + row * segments + segment
+    for k in range(edges[at_edge], edges[at_edge + 1]):
         point = (slab // 3) * sizes.points + order[slab * sizes.points + k]
         at = texel_position(points[point], plane, sizes)
         x = int(wp.floor(at[0]))

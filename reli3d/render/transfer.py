@@ -51,11 +51,12 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 @full_precision
 def light_harmonics(light: Environment) -> Tensor:
-    """Coefficients ``(16, 3)`` of an environment: a sum over texels weighted by solid angle, computed in float64."""
+    """Coefficients ``(16, 3)`` of an environment, on its device: a sum over texels weighted by solid angle, computed in
+    float64."""
     height, width = light.radiance.shape[:2]
     d = lat_long_directions(height, width, dtype=torch.float64)
     weight = spherical_harmonics(d) * texel_solid_angles(height, width)[:, None, None]
-    return torch.einsum("hwk,hwc->kc", weight, light.radiance.detach().cpu().double()).float()
+    return torch.einsum("hwk,hwc->kc", weight, light.radiance.detach().cpu().double()).to(light.radiance)
 
 
 @full_precision

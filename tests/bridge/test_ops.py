@@ -202,9 +202,9 @@ def test_second_derivatives_are_right_or_refused(device, name, of):
     def derivative(leaves, k, **options):
         """Along a random direction of the input ``k``."""
         loss = loss_of(tuple(of(out) for out in case.run(**leaves) if out.is_floating_point()))
-        return (torch.autograd.grad(loss, leaves[k], **options)[0] * moves[k]).double()
+        return (torch.autograd.grad(loss, leaves[k], **options)[0] * moves[k].to(loss.device)).double()
 
-    def bend(k, other):
+    def bend(k, other, device=device):
         leaves = strided(leaves_of(case, device))  # the second derivative is taken of the inputs, not of copies
         along = derivative(leaves, k, create_graph=True).sum()
         return torch.autograd.grad(along, leaves[other], allow_unused=True)[0] if along.requires_grad else None
@@ -215,6 +215,9 @@ def test_second_derivatives_are_right_or_refused(device, name, of):
         except RuntimeError as error:
             refused = "once_differentiable" in str(error) or isinstance(error, NotImplementedError)  # ours; torch's
             assert refused and k not in case.second, (k, other)
+            continue
+        if got is not None and torch.device(device).type == "cuda":  # its sums take any order: noise over the step
+            assert k in case.second and reference.fraction_within(got, bend(k, other, "cpu"), 1e-3) >= 0.999, (k, other)
             continue
         ends = []
         for sign in (1.0, -1.0):
