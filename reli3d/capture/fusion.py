@@ -37,6 +37,7 @@ GRIDS = 64, 96  # cells along the volume's side, first and last
 LEAST_SEEN = 0.5  # fraction of the views that must show a cell
 VOLUME_SIDE = 2.0, 1.15  # sides of the volume over those of the object so far, first and last
 PRIOR_INSIDE, PRIOR_OUTSIDE = 3.0, 6.0  # largest log odds by the distance in pixels from the volume's silhouette
+SHADOW_HEIGHT = 0.1, 0.4  # of the object's longest side and of its height: lower cells may be a shadow on the plane
 CERTAIN = 3.0  # log odds from which GrabCut keeps a pixel
 LIMIT_PIXELS = 12  # around the silhouette: farther out nothing is the object
 
@@ -74,8 +75,9 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     The log odds of a pixel, object over background, compare a mixture of Gaussians of the object's colors with the
     plane's texture, or elsewhere with the colors around the object.  Of each cell of a volume they give the log odds
     that it is occupied (Franco and Boyer 2005): one view that sees the background through a cell empties it, and all
-    have to agree on an occupied one.  The volume's silhouettes are added to the log odds of the pixels, and GrabCut
-    starts there.
+    have to agree on an occupied one.  In the second pass the texture is that of all views in which no cell above
+    SHADOW_HEIGHT covers it: a contact shadow, which the first masks include, becomes a part of the texture.  The
+    volume's silhouettes are added to the log odds of the pixels, and GrabCut starts there.
     """
     if scene.plane is None:
         return masks
@@ -84,15 +86,18 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     inside = [full_size(masks[s.view.photo.name], s.image.shape) > 127 for s in smalls]
     points = (found.points[scene.object] - axes.origin) @ axes.axes.T
     box = np.stack([np.minimum(points.min(0), [np.inf, np.inf, 0]), points.max(0)])
+    cover = inside
     for cells, growth in zip(GRIDS, VOLUME_SIDE, strict=True):
-        texture = _plane_texture(smalls, inside, axes, scene)
+        texture = _plane_texture(smalls, cover, axes, scene)
         expected = [_expected(texture, axes, s) for s in smalls]
         evidence = _evidence(smalls, inside, expected)
         occupied, cell = _occupied(smalls, evidence, axes, box, points, cells, growth)
         if len(occupied) == 0:
             return masks
         box = np.stack([occupied.min(0), occupied.max(0)])
+        high = occupied[:, 2] > min(SHADOW_HEIGHT[0] * (box[1] - box[0]).max(), SHADOW_HEIGHT[1] * box[1, 2])
         occupied = occupied @ axes.axes + axes.origin
+        cover = [_silhouette(s, occupied[high], cell) for s in smalls]
         inside = [_segmented(s, e, occupied, cell) for s, e in zip(smalls, evidence, strict=True)]
     pixels = [(s.view.photo.name, s.view.photo.pixels) for s in smalls]
     return {
@@ -242,6 +247,13 @@ def _log_odds(image: np.ndarray, inside: np.ndarray, plane: _Expected, own: _Col
     return np.clip(cv2.GaussianBlur(np.clip(odds, -8, 8), (0, 0), 1.2), -limit, limit)
 
 
+def _shown(pixels: np.ndarray, depth: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Column and row of the pixels inside an image of ``shape``, and which of ``pixels (N, 2)`` these are ``(N,)``."""
+    x, y = np.floor(pixels).astype(np.int64).T
+    shown = (depth > 0) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+    return x[shown], y[shown], shown
+
+
 def _occupied(smalls, evidence, axes: _Axes, box, points, cells: int, growth: float) -> tuple[np.ndarray, float]:
     """Centers ``(N, 3)``, in ``axes``, of the occupied cells connected to ``points``, and their size."""
     middle, side = box.mean(0), growth * float((box[1] - box[0]).max())
@@ -252,10 +264,8 @@ def _occupied(smalls, evidence, axes: _Axes, box, points, cells: int, growth: fl
     flat = grid.reshape(-1, 3) @ axes.axes + axes.origin
     odds, seen = np.zeros(len(flat)), np.zeros(len(flat))
     for small, e in zip(smalls, evidence, strict=True):
-        pixels, depth = small.project(flat)
-        x, y = np.floor(pixels).astype(np.int64).T
-        shown = (depth > 0) & (x >= 0) & (y >= 0) & (x < e.shape[1]) & (y < e.shape[0])
-        odds[shown] -= np.log(COVERED + (1 - COVERED) * np.exp(-e[y[shown], x[shown]]))
+        x, y, shown = _shown(*small.project(flat), e.shape)
+        odds[shown] -= np.log(COVERED + (1 - COVERED) * np.exp(-e[y, x]))
         seen += shown
     full = (odds > 0) & (seen >= LEAST_SEEN * len(smalls)) & (grid[..., 2].ravel() > 0)
     label, count = ndimage.label(full.reshape(grid.shape[:3]))
@@ -271,18 +281,23 @@ def _occupied(smalls, evidence, axes: _Axes, box, points, cells: int, growth: fl
     return grid[label == best], cell
 
 
+def _silhouette(small: _Small, centers: np.ndarray, cell: float) -> np.ndarray:
+    """``(H, W)`` uint8, 1 where the view shows the cells of size ``cell`` about ``centers (N, 3)``."""
+    pixels, depth = small.project(centers)
+    x, y, shown = _shown(pixels, depth, small.image.shape)
+    silhouette = np.zeros(small.image.shape[:2], np.uint8)
+    silhouette[y, x] = 1
+    if len(x) == 0:
+        return silhouette
+    width = int(np.ceil(small.view.focal * small.scale * cell / np.median(depth[shown]))) + 2
+    return cv2.morphologyEx(silhouette, cv2.MORPH_CLOSE, np.ones((width, width), np.uint8))
+
+
 def _segmented(small: _Small, evidence: np.ndarray, occupied: np.ndarray, cell: float) -> np.ndarray:
     """Mask ``(H, W)`` by GrabCut, which starts from the evidence and the silhouette of the occupied cells."""
-    h, w = evidence.shape
-    pixels, depth = small.project(occupied)
-    x, y = np.floor(pixels).astype(np.int64).T
-    shown = (depth > 0) & (x >= 0) & (y >= 0) & (x < w) & (y < h)
-    silhouette = np.zeros((h, w), np.uint8)
-    silhouette[y[shown], x[shown]] = 1
-    if not shown.any():
-        return silhouette > 0
-    width = int(np.ceil(small.view.focal * small.scale * cell / np.median(depth[shown]))) + 2
-    closed = cv2.morphologyEx(silhouette, cv2.MORPH_CLOSE, np.ones((width, width), np.uint8))
+    closed = _silhouette(small, occupied, cell)
+    if not closed.any():
+        return closed > 0
     away = cv2.distanceTransform(closed, cv2.DIST_L2, 3) - cv2.distanceTransform(1 - closed, cv2.DIST_L2, 3)
     odds = evidence + np.clip(away, -PRIOR_OUTSIDE, PRIOR_INSIDE)
     labels = np.where(odds > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
