@@ -55,8 +55,8 @@ class Render:
     def rgba(self) -> Tensor:
         """``(H, W, 4)``: premultiplied radiance and alpha, for :func:`reli3d.write_image`.
 
-        Only valid with ``background="transparent"``.  With ``background="environment"``, use ``radiance``, which
-        is already composited: PNG files store colors divided by alpha, which would brighten the background.
+        Only valid with ``background="transparent"``.  With ``background="environment"``, save ``radiance``: it includes
+        the background, which ``alpha`` does not, and a PNG file stores colors divided by alpha.
         """
         return torch.cat([self.radiance, self.alpha[..., None]], -1)
 

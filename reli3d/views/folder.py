@@ -60,8 +60,8 @@ def load_views(
     neither is given: all views, or 16 selected by farthest-point sampling if there are more.  every: read all views,
     without limit; :meth:`Views.taken` then selects 16.  masks: folder of masks; None: ``mask_path`` of a frame, alpha,
     or a folder ``masks`` or ``mask``, in this order.  whole: downsample images above two megapixels to two megapixels
-    instead of cropping them to the object.  remove_background: segment images without a mask by ``rembg`` (extra
-    ``masks``), which may download its network.
+    instead of cropping them to the object.  remove_background: compute the masks of images that have none with
+    ``rembg`` (``pip install "reli3d[masks]"``), which may download its network.
 
     Cameras far from the world origin are translated by ``-Views.origin``.  Raises InputError with one line that names
     file, field, value and fix.
