@@ -18,7 +18,7 @@ from reli3d.capture.fusion import fused_masks
 from reli3d.capture.mapping import Map, View, map_photos
 from reli3d.capture.masks import grabcut_mask, is_empty, key_mask, moving_region, touches_border
 from reli3d.capture.photos import FEWEST, PHOTO_SUFFIXES, Photo, Progress, read_photos
-from reli3d.capture.rigidity import Group, epipolar_fit, rigid_groups
+from reli3d.capture.rigidity import Frame, Group, epipolar_fit, inside_mask, rigid_groups
 from reli3d.capture.scene import Scene, find_scene
 from reli3d.capture.sheet import contact_sheet
 from reli3d.errors import InputError, printable
@@ -283,8 +283,10 @@ def _refined(
     report.epipolar_fit = after
     groups = groups if lenses else []
     if groups:
-        moved = {name: group.moved(by_name[name]) for group in groups for name in group.names}
-        second = replace(second, views=tuple(_posed(v, moved.get(v.photo.name)) for v in second.views))
+        posed = {v.photo.name: v for v in second.views}
+        for name, pose in ((name, group.moved(by_name[name])) for group in groups for name in group.names):
+            posed[name] = replace(posed[name], rotation=pose.rotation, translation=pose.translation)
+        second = replace(second, views=tuple(posed.values()))
     report.notes.append("the object was moved relative to its surroundings: its own features decide on the cameras")
     again = [v for v in second.views if v.photo.name in segmented.masks]
     support = None
@@ -304,10 +306,6 @@ def _refined(
     similar = directions @ directions.T > SAME_UP  # an object that was turned over has two: that of most views is up
     upward = directions[similar[similar.sum(1).argmax()]].mean(0)
     return refined, upward / np.linalg.norm(upward), None
-
-
-def _posed(view: View, pose: View | None) -> View:
-    return replace(view, rotation=pose.rotation, translation=pose.translation) if pose else view
 
 
 def _mean_up(found: Map) -> np.ndarray:
@@ -388,22 +386,7 @@ def _least_compatible(views: Sequence[View], masks: dict[str, np.ndarray]) -> in
     return int(np.argmax(scores))
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """``x -> scale (turn x) + shift``."""
-
-    scale: float
-    turn: np.ndarray  # (3, 3)
-    shift: np.ndarray  # (3,)
-
-    def apply(self, points: np.ndarray) -> np.ndarray:
-        return self.scale * points @ self.turn.T + self.shift
-
-    def inverse(self, points: np.ndarray) -> np.ndarray:
-        return (points - self.shift) @ self.turn / self.scale
-
-
-def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float | None) -> tuple[_Frame, np.ndarray]:
+def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float | None) -> tuple[Frame, np.ndarray]:
     """``up`` to +Y, the ground at 0, the middle of the ``hull (N, 3)`` above the origin, its longest side 1 or
     ``size`` millimeters; and the box ``(2, 3)`` of the hull in it.
     """
@@ -420,16 +403,14 @@ def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float |
     scale = (1.0 if size is None else size / 1000.0) / float((high - low).max())
     middle = (low + high) / 2
     middle[1] = bottom
-    return _Frame(scale, turn, -scale * middle), scale * (np.stack([low, high]) - middle)
+    return Frame(scale, turn, -scale * middle), scale * (np.stack([low, high]) - middle)
 
 
 def _object_points(final: _Segmented, views: Sequence[View]) -> np.ndarray:
     """Points of the map that lie inside the masks of the views that observe them."""
     hits, count = np.zeros(len(final.found.points)), np.zeros(len(final.found.points))
     for view in views:
-        mask = final.masks[view.photo.name]
-        x, y = np.clip(view.pixels.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
-        np.add.at(hits, view.points, mask[y, x] > 127)
+        np.add.at(hits, view.points, inside_mask(final.masks[view.photo.name], view.pixels))
         np.add.at(count, view.points, 1)
     return final.found.points[(count >= 2) & (hits > 0.7 * count)]
 
@@ -477,7 +458,7 @@ def _check(report: CaptureReport) -> None:
     report.failed = [text for passed, text in checks if not passed]
 
 
-def _write(output: Path, views, masks, frame: _Frame, box: np.ndarray, report: CaptureReport, points, progress) -> None:
+def _write(output: Path, views, masks, frame: Frame, box: np.ndarray, report: CaptureReport, points, progress) -> None:
     stems = [Path(v.photo.name).stem for v in views]
     if len(set(stems)) < len(stems):
         stems = [f"{k:04d}" for k in range(len(views))]

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from reli3d.capture.mapping import Map, View
 from reli3d.capture.masks import COARSE_SIDE, full_size, grabcut, reduced, refined
-from reli3d.capture.scene import Plane, Scene
+from reli3d.capture.scene import Scene
 
 TEXEL = 1.5  # pixels at COARSE_SIDE, at the cameras' median distance
 ROWS, GAIN_STEP = 64, 4  # texels: rows at a time; gains are compared at every fourth in both directions
@@ -62,12 +62,6 @@ class _Axes:
     origin: np.ndarray
     axes: np.ndarray
 
-    @staticmethod
-    def of(plane: Plane, center: np.ndarray) -> _Axes:
-        u = np.cross(plane.normal, np.eye(3)[np.abs(plane.normal).argmin()])
-        u /= np.linalg.norm(u)
-        return _Axes(plane.foot(center), np.stack([u, np.cross(plane.normal, u), plane.normal]))
-
 
 def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Masks by name of the views in ``masks``, which may lack parts of the object; unchanged without a support plane.
@@ -81,7 +75,7 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     """
     if scene.plane is None:
         return masks
-    axes = _Axes.of(scene.plane, scene.center)
+    axes = _Axes(scene.plane.foot(scene.center), scene.plane.axes)
     smalls = [_Small(v, *reduced(v.photo.pixels, COARSE_SIDE)) for v in found.views if v.photo.name in masks]
     inside = [full_size(masks[s.view.photo.name], s.image.shape) > 127 for s in smalls]
     points = (found.points[scene.object] - axes.origin) @ axes.axes.T
@@ -264,7 +258,8 @@ def _occupied(smalls, evidence, axes: _Axes, box, points, cells: int, growth: fl
     flat = grid.reshape(-1, 3) @ axes.axes + axes.origin
     odds, seen = np.zeros(len(flat)), np.zeros(len(flat))
     for small, e in zip(smalls, evidence, strict=True):
-        x, y, shown = _shown(*small.project(flat), e.shape)
+        pixels, depth = small.project(flat)
+        x, y, shown = _shown(pixels, depth, e.shape)
         odds[shown] -= np.log(COVERED + (1 - COVERED) * np.exp(-e[y, x]))
         seen += shown
     full = (odds > 0) & (seen >= LEAST_SEEN * len(smalls)) & (grid[..., 2].ravel() > 0)

@@ -238,9 +238,8 @@ def _read_model(model, database, by_path: dict[str, Photo], scales: dict[str, fl
     error = np.array([p.error for p in model.points3D.values()])
     tracks = np.array([p.track.length() for p in model.points3D.values()])
     views = []
-    for image in model.images.values():
-        if not image.has_pose:
-            continue
+    registered = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name.rpartition("/")[2])
+    for image in registered:
         scale, camera, pose = scales[image.name], model.cameras[image.camera_id], image.cam_from_world()
         focal, cx, cy, radial = camera.params
         observed = [p for p in image.points2D if p.has_point3D()]
@@ -256,18 +255,14 @@ def _read_model(model, database, by_path: dict[str, Photo], scales: dict[str, fl
                 np.array([index[p.point3D_id] for p in observed], dtype=np.int64),
             )
         )
-    order = {id(photo): k for k, photo in enumerate(by_path.values())}
-    views.sort(key=lambda v: order[id(v.photo)])
-    return Map(tuple(views), points, error, tracks, _matches(views, database, by_path, scales))
+    return Map(tuple(views), points, error, tracks, _matches(database, [image.name for image in registered], scales))
 
 
-def _matches(views: list[View], database, by_path: dict[str, Photo], scales: dict[str, float]) -> tuple:
-    path_of = {id(photo): path for path, photo in by_path.items()}
-    paths = [path_of[id(v.photo)] for v in views]
+def _matches(database, paths: Sequence[str], scales: dict[str, float]) -> tuple:
     numbers = [database.read_image_with_name(path).image_id for path in paths]
     pixels = [database.read_keypoints(n)[:, :2] / scales[path] for n, path in zip(numbers, paths, strict=True)]
     found = []
-    for b in range(len(views)):
+    for b in range(len(paths)):
         for a in range(b):
             pairs = database.read_matches(numbers[a], numbers[b]).astype(np.int64)
             if len(pairs) > 0:

@@ -36,9 +36,8 @@ def epipolar_fit(
             continue
         if between is not None and group_of.get(first.photo.name, -1) == group_of.get(second.photo.name, -2):
             continue
-        kept = (_inside(masks[first.photo.name], pixels_a) == inside) & (
-            _inside(masks[second.photo.name], pixels_b) == inside
-        )
+        kept = inside_mask(masks[first.photo.name], pixels_a) == inside
+        kept &= inside_mask(masks[second.photo.name], pixels_b) == inside
         if kept.sum() < FEWEST_MATCHES:
             continue
         x, y = first.normalized(pixels_a[kept]), second.normalized(pixels_b[kept])
@@ -50,7 +49,8 @@ def epipolar_fit(
     return fitting / best if best else 1.0
 
 
-def _inside(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def inside_mask(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Which of ``pixels (N, 2)`` lie inside, ``(N,)``."""
     x, y = np.clip(pixels.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
     return mask[y, x] > 127
 
@@ -70,17 +70,25 @@ def _sampson(x: np.ndarray, y: np.ndarray, essential: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Group:
-    """Views, by name, that are related by one similarity ``x -> scale (turn x) + shift`` from a map to another."""
+class Frame:
+    """``x -> scale (turn x) + shift``: from a map to another one, or to the object folder."""
 
-    names: tuple[str, ...]
     scale: float
     turn: np.ndarray  # (3, 3)
     shift: np.ndarray  # (3,)
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """``points (..., 3)`` in the other map."""
         return self.scale * points @ self.turn.T + self.shift
+
+    def inverse(self, points: np.ndarray) -> np.ndarray:
+        return (points - self.shift) @ self.turn / self.scale
+
+
+@dataclass(frozen=True)
+class Group(Frame):
+    """Views, by name, that are related by one similarity from a map to another."""
+
+    names: tuple[str, ...]
 
     def moved(self, view: View) -> View:
         """The view's pose in the other map."""
@@ -116,7 +124,7 @@ def rigid_groups(first: Map, second: Map) -> list[Group]:
         scale, turn, shift = _similarity(a[best], b[best])
         if np.median(np.linalg.norm(scale * a[best] @ turn.T + shift - b[best], axis=1)) > limit:
             break
-        groups.append(Group(tuple(p[0].photo.name for p, k in zip(pairs, best, strict=True) if k), scale, turn, shift))
+        groups.append(Group(scale, turn, shift, tuple(p[0].photo.name for p, k in zip(pairs, best, strict=True) if k)))
         pairs = [p for p, k in zip(pairs, best, strict=True) if not k]
     return groups
 

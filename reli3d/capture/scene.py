@@ -38,9 +38,16 @@ class Plane:
         """Signed distance ``(N,)`` of ``points (N, 3)``, positive above."""
         return points @ self.normal + self.offset
 
+    @property
+    def axes(self) -> np.ndarray:
+        """Rows: two unit directions in the plane, and its normal."""
+        u = np.cross(self.normal, np.eye(3)[np.abs(self.normal).argmin()])
+        u /= np.linalg.norm(u)
+        return np.stack([u, np.cross(self.normal, u), self.normal])
+
     def foot(self, point: np.ndarray) -> np.ndarray:
         """The point of the plane nearest to ``point (3,)``."""
-        return point - (point @ self.normal + self.offset) * self.normal
+        return point - self.height(point) * self.normal
 
 
 @dataclass(frozen=True)
@@ -113,9 +120,7 @@ def find_plane(points: np.ndarray, eyes: np.ndarray, distance: float) -> Plane |
 def plane_area(plane: Plane, points: np.ndarray, distance: float) -> int:
     """Cells of the plane, AREA_CELL wide, that hold inliers."""
     inside = points[np.abs(plane.height(points)) < PLANE_TOLERANCE * distance]
-    u = np.cross(plane.normal, np.eye(3)[np.abs(plane.normal).argmin()])
-    u /= np.linalg.norm(u)
-    flat = np.stack([inside @ u, inside @ np.cross(plane.normal, u)], 1) / (AREA_CELL * distance)
+    flat = inside @ plane.axes[:2].T / (AREA_CELL * distance)
     return len(np.unique(np.floor(flat).astype(np.int64), axis=0))
 
 

@@ -41,7 +41,7 @@ def test_matches_on_a_moved_object_do_not_fit_the_cameras(moved):
     fit = epipolar_fit(found, masks)
     assert fit < 0.75 if moved else fit > 0.97  # 36 of 66 pairs are across the motion
     assert epipolar_fit(found, masks, inside=False) > 0.97
-    passes = [Group(tuple(str(k) for k in part), 1.0, np.eye(3), np.zeros(3)) for part in (range(6), range(6, 12))]
+    passes = [Group(1.0, np.eye(3), np.zeros(3), tuple(str(k) for k in part)) for part in (range(6), range(6, 12))]
     between = epipolar_fit(found, masks, between=passes)
     assert between < 0.5 if moved else between > 0.97
 
