@@ -344,9 +344,10 @@ OPS = {
 @pytest.mark.parametrize("name", OPS)
 def test_the_adjoint_is_that_of_the_float64_reference(device, name):
     """Of the entries that are not 0; those below a hundredth of their median are judged as if they were as large.  No
-    kink is left out but the deviation's absolute values, which it takes in float64.
+    kink is left out but the deviation's absolute values, which it takes in float64.  CUDA adds in any order, and the
+    reference of ``centers`` starts from vertices of the CPU: there 1e-3 instead of 1e-4.
     """
-    op = OPS[name](torch.Generator().manual_seed(7))
+    op, relative = OPS[name](torch.Generator().manual_seed(7)), 1e-4 if device.type == "cpu" else 1e-3
     double = op.double()
     expected = op.in_float64(*double)
     ours = [v.to(device).requires_grad_() for v in op.leaves.values()]
@@ -360,9 +361,9 @@ def test_the_adjoint_is_that_of_the_float64_reference(device, name):
     for leaf, a, b in zip(op.leaves, grads, expected_grads, strict=True):
         if leaf in op.unit:
             a, b = (reference.across(v, op.leaves[leaf]) for v in (a, b))
-            found = len(b), reference.rows_within(a, b)
+            found = len(b), reference.rows_within(a, b, relative)
         else:
             a, b = a.cpu().double()[b != 0], b[b != 0]
-            near = (a - b).abs() <= 1e-4 * b.abs().clamp(min=1e-2 * float(b.abs().median()))
+            near = (a - b).abs() <= relative * b.abs().clamp(min=1e-2 * float(b.abs().median()))
             found = len(b), float(near.double().mean())
         assert found[0] >= (24 if op.one_sign else 1000) and found[1] >= 0.999, (leaf, *found)

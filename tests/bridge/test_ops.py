@@ -234,7 +234,11 @@ def test_second_derivatives_are_right_or_refused(device, name, of):
 
 
 def fractions_within(case: Case, first, second) -> dict[str, float]:
-    """How many entries of every output and gradient on the device ``second`` are within 1e-4 of those on ``first``."""
+    """How many entries of every output and gradient on the device ``second`` are within 1e-3 of those on ``first``.
+
+    On CUDA products and sums are contracted and sums take any order: of the values below a tenth of the median, which
+    are differences of larger ones, 0.1 % are not within 1e-4.
+    """
     found, results = {}, []
     for device in (first, second):
         leaves = leaves_of(case, device, N)
@@ -246,7 +250,7 @@ def fractions_within(case: Case, first, second) -> dict[str, float]:
         if got.shape != expected.shape:
             found[key] = 0.0
         elif expected.is_floating_point():
-            found[key] = reference.fraction_within(got, expected)
+            found[key] = reference.fraction_within(got, expected, 1e-3)
         else:
             found[key] = float((got == expected.cpu()).double().mean())
     return found
