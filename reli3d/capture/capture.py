@@ -443,7 +443,7 @@ def _check(report: CaptureReport) -> None:
             f"{100 * report.epipolar_fit:.0f} % of the matches on the object fit the cameras, at least 80 % expected: "
             "the object was moved relative to its surroundings",
         ),
-        (report.gap < WIDEST_GAP, f"no view within a sector of {report.gap:.0f} degrees, at most 60 expected"),
+        (report.gap < WIDEST_GAP, f"no view within a sector of {math.floor(report.gap)} degrees, at most 60 expected"),
         (report.object_points >= LEAST_POINTS, f"{report.object_points} points on the object, at least 200 expected"),
         (
             report.agreement >= LEAST_AGREEMENT,
