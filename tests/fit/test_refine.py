@@ -46,14 +46,14 @@ def half_colors(asset, stripes: float = 0.0) -> torch.Tensor:
 
 def test_a_small_scene_is_recovered(refined, start):
     assert refined.parts == ALL
-    # 60 coarse steps; the bounds are about half of the measured values (input +11 dB, held out +8 dB)
+    # 60 coarse steps; the bounds are below the measured values (input +10 dB, held out +6.5 dB)
     assert refined.after[0] > refined.before[0] + 5.0
     assert refined.after[1] > refined.before[1] + 5.0
     got = half_colors(refined.asset, STRIPES)
     expected = srgb_to_linear(torch.tensor([[0.8, 0.25, 0.2], [0.25, 0.6, 0.3]]))
     # a factor per channel is ambiguous between base color and light; the ratio of the stripes is not
     error = ((got[0] / got[1]).log() - (expected[0] / expected[1]).log()).abs()
-    # measured 0.55 of the error of gray: 60 steps are few, and the palette draws colors together at first
+    # measured 0.54 of the error of gray: 60 steps are few, and the palette draws colors together at first
     assert float(error.max()) < 0.65 * float((expected[0] / expected[1]).log().abs().max())
 
 
