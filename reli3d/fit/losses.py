@@ -30,7 +30,7 @@ class Weights:
     sdf_change: float = 2e-3  # of the squared change of the signed distance; divided by the number of views
     image: float = 1.0  # of :func:`display_error` in the fit of the maps and the lighting
     palette: float = 0.01  # of :func:`palette`
-    hue: float = 0.005  # of :func:`hue_drift`
+    hue: float = 0.1  # of :func:`hue_drift`
     base_coarse: float = 0.02  # pulls the base color's coarse field to the start; divided by the number of views
     base_color: float = 20.0  # of :func:`near_base_color`; over the 4th power of the number of views with used colors
     finish: float = 0.05  # pulls roughness and metallic to the start; divided by the number of views

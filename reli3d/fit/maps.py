@@ -25,7 +25,7 @@ from reli3d.render.points import SurfacePoints
 PIXELS_PER_STEP = 6144
 SHADING_SAMPLES = ((6, 6, 2), (12, 12, 4))  # of light, BSDF and cosine, in the first and the second half of a stage
 MAX_PIXELS = 400_000  # of all images: 46 MB; of more, a random subset
-LEARNING_RATES = {"material": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01, "light_scale": 0.06}
+LEARNING_RATES = {"material": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
 GRID_INTERVAL = 0.1  # of a stage's progress, after which the next finer map or grid is optimized as well
 DETAIL_FROM = 0.35  # progress from which the texture detail is optimized
 MATERIAL_UNTIL = 0.7  # progress at which the material is frozen, and the bend is reset and fitted with a stronger prior
@@ -163,31 +163,6 @@ def maps_loss(
     return loss
 
 
-class LightScale:
-    """Logarithm of a factor per color channel that multiplies the lighting and divides the base color.
-
-    Diffuse radiance is invariant to the factor; highlights and priors determine it.  In the separate variables of
-    lighting and base color, a step of either alone changes the images, so the fit hardly moves along this direction.
-    """
-
-    def __init__(self, base_color: Tensor):
-        self.log = base_color.new_zeros(3, requires_grad=True)
-        self.logits_per_log = float(1.0 / (1.0 - base_color.mean()).clamp(min=0.1))  # d logit(b) / d log b
-
-    def set_gradient(self, unknowns: Unknowns) -> None:
-        """Sets the gradient of ``log`` from the gradients of the coarsest lighting map and base color grid."""
-        light, material = unknowns.light[0].grad, unknowns.material[0].grad
-        if light is not None and material is not None:  # the material is frozen at the end
-            self.log.grad = light.sum((0, 1, 2)) - self.logits_per_log * material[..., :3].sum((0, 1, 2))
-
-    @torch.no_grad()
-    def apply(self, unknowns: Unknowns) -> None:
-        """Applies the factor to the coarsest lighting map and base color grid, and resets it to 1."""
-        unknowns.light[0] += self.log
-        unknowns.material[0][..., :3] -= self.logits_per_log * self.log
-        self.log.zero_()
-
-
 def fading(progress: float, settled: bool) -> float:
     """Learning-rate factor, which falls linearly from 1 to 0.1.
 
@@ -218,9 +193,6 @@ def fit_maps(
             groups.append({"params": [value], "lr": 0.0, "full": LEARNING_RATES[which]})
             opens.append(DETAIL_FROM if which == "detail" else GRID_INTERVAL * k)
             value.requires_grad_(True)
-    light_scale = LightScale(material_of(pixels.logits)[0])
-    groups.append({"params": [light_scale.log], "lr": 0.0, "full": LEARNING_RATES["light_scale"]})
-    opens.append(0.0)
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     first, settled = 0, False
     free, kept = weights.free_bend * len(data.used), weights.bend / len(data.used) ** 2
@@ -243,9 +215,7 @@ def fit_maps(
         loss = maps_loss(unknowns, data, pixels, rows, replace(weights, bend=kept if settled else free), estimate)
         optimizer.zero_grad()  # to None: Adam skips frozen tensors
         loss.backward()
-        light_scale.set_gradient(unknowns)
         optimizer.step()
-        light_scale.apply(unknowns)
         budget.record(stage.name, step, float(loss.detach()))
     for group in optimizer.param_groups:
         group["params"][0].requires_grad_(False)

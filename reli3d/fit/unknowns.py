@@ -27,8 +27,8 @@ FINISH_GRIDS = 2  # number of them that roughness and metallic have: images cons
 START_GRID = 32  # points along a side of the box
 MAX_BEND = 0.3  # length of the vector added to a unit normal: 17 degrees
 BEND_GRIDS = (8, 16, 32, 64)  # finer than the material's, which must not explain errors of the normals
-LIGHT_ROWS = 64
-LIGHT_MAPS = (4, 8, 16, 32, 64)  # rows of the maps
+LIGHT_ROWS = 32
+LIGHT_MAPS = (4, 8, 16, 32)  # rows of the maps
 MIN_RELATIVE_RADIANCE = 1e-4  # of the start's mean; its logarithm must be finite
 
 

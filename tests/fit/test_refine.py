@@ -18,13 +18,12 @@ from reli3d.render.environment import Environment
 from tests.support import small_scene
 
 SIZE, VIEWS, STEPS = 48, 6, 60
-STRIPES = 8.0  # narrow: smooth lighting explains the two halves of a convex diffuse object as well as two base colors
 ALL = Parts(1.0, 1.0, 1.0)
 
 
 @pytest.fixture(scope="module")
 def views():
-    return small_scene.input_views(small_scene.two_colored(small_scene.ball(), STRIPES), VIEWS, SIZE)
+    return small_scene.input_views(small_scene.two_colored(small_scene.ball()), VIEWS, SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -37,35 +36,33 @@ def refined(start, views):
     return fit.refine(start, views, steps=STEPS, resolution=24, seed=3)
 
 
-def half_colors(asset, stripes: float = 0.0) -> torch.Tensor:
-    """Mean linear base color of the faces of either half or of the stripes of either color, ``(2, 3)``."""
+def half_colors(asset) -> torch.Tensor:
+    """Mean linear base color of the faces of either half, ``(2, 3)``."""
     at = small_scene.centers(asset)
-    side = small_scene.side(at.position, stripes)
-    return torch.stack([at.base_color[side * s > 0.25].mean(0) for s in (1.0, -1.0)])
+    return torch.stack([at.base_color[at.position[:, 0] * s > 0.25].mean(0) for s in (1.0, -1.0)])
 
 
 def test_a_small_scene_is_recovered(refined, start):
     assert refined.parts == ALL
-    # 60 coarse steps; the bounds are below the measured values (input +10 dB, held out +6.5 dB)
+    # 60 coarse steps; the bounds are about half of the measured values (input +11 dB, held out +8 dB)
     assert refined.after[0] > refined.before[0] + 5.0
     assert refined.after[1] > refined.before[1] + 5.0
-    got = half_colors(refined.asset, STRIPES)
+    got = half_colors(refined.asset)
     expected = srgb_to_linear(torch.tensor([[0.8, 0.25, 0.2], [0.25, 0.6, 0.3]]))
-    # a factor per channel is ambiguous between base color and light; the ratio of the stripes is not
+    # a factor per channel is ambiguous between base color and light; the ratio of the halves is not
     error = ((got[0] / got[1]).log() - (expected[0] / expected[1]).log()).abs()
-    # measured 0.54 of the error of gray: 60 steps are few, and the palette draws colors together at first
+    # measured 0.63 of the error of gray: 60 steps are few, and the palette draws colors together at first
     assert float(error.max()) < 0.65 * float((expected[0] / expected[1]).log().abs().max())
 
 
-def test_few_views_fit_the_light_and_keep_the_base_color():
+def test_few_views_fit_the_light_and_keep_the_base_color(views):
     true = small_scene.two_colored(small_scene.ball())
-    views = small_scene.input_views(true, VIEWS, SIZE)
     first = replace(true, environment=Environment(torch.full((16, 32, 3), 0.5)))
     three = {name: getattr(views, name)[:3] for name in ("images", "masks", "c2w", "intrinsics")}
     few = replace(views, **three, names=())
     off = []
     for weights in (Weights(), Weights(base_color=0.0)):
-        result = fit.refine(first, few, steps=STEPS, resolution=24, weights=weights)
+        result = fit.refine(first, few, steps=30, resolution=24, weights=weights)
         assert result.parts.light == 0.5 and result.after[0] > result.before[0] + 1.0
         off.append(float((half_colors(result.asset) / half_colors(true)).log().abs().mean()))
     assert off[0] < 0.5 * off[1]  # the base color was right at the start, the light was not

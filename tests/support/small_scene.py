@@ -38,18 +38,13 @@ def sky() -> Environment:
     return Environment((row * column * torch.tensor([0.9, 1.0, 1.1])).contiguous())
 
 
-def side(position: torch.Tensor, stripes: float = 0.0) -> torch.Tensor:
-    """Positive where the ball is red: on one half, or on the half waves of ``stripes`` radians per unit of length."""
-    return torch.sin(stripes * position[:, 0]) if stripes else position[:, 0]
-
-
-def two_colored(asset: Asset, stripes: float = 0.0) -> Asset:
-    """The ball with a red and a green half, or stripes of them (:func:`side`), and the sky around it."""
+def two_colored(asset: Asset) -> Asset:
+    """The ball with a red and a green half and the sky around it."""
     from reli3d.geometry.bake import bake
 
     def base_color(position, normal):
-        red = torch.sigmoid(40.0 / max(stripes, 1.0) * side(position, stripes))[:, None]
-        return red * torch.tensor([0.8, 0.25, 0.2]) + (1.0 - red) * torch.tensor([0.25, 0.6, 0.3])
+        side = torch.sigmoid(40.0 * position[:, :1])
+        return side * torch.tensor([0.8, 0.25, 0.2]) + (1.0 - side) * torch.tensor([0.25, 0.6, 0.3])
 
     color = srgb_to_linear(bake(asset.mesh, TEXELS, base_color)["value"])
     return Asset(asset.mesh, replace(asset.textures, base_color=color), sky())
