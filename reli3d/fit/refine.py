@@ -99,11 +99,11 @@ def refine(
     views: images, masks and cameras in the frame of ``asset``.  seconds, steps: the budget, exactly one of the two;
     with ``steps`` the result is deterministic on one CPU, not on CUDA.  resolution: grid cells along the longest side,
     raised automatically for thin objects (:func:`~reli3d.fit.shape.start_grid`).  weights: loss weights; None: the
-    defaults. cameras: optimize the camera poses as well.  light: ``object``: the lighting is fixed to the object;
+    defaults.  cameras: optimize the camera poses as well.  light: ``object``: the lighting is fixed to the object;
     ``camera``: it is fixed to the camera, as on a turntable or with a flash; a sequence of labels, one per view: views
     with equal labels share their lighting.  Unless ``object``, the result has the lighting of view 0.  seed: random
-    seed. bar: show progress on stderr.  interrupt: called before every step; once it returns True the fit ends with the
-    best result so far.
+    seed.  bar: show progress on stderr.  interrupt: called before every step; once it returns True the fit ends with
+    the best result so far.
 
     With three or more views, some are held out (:func:`held_out`).  Of these the fit uses the masks but not the
     colors.  After the fit, the errors of the fitted and of the held-out views decide whether the fitted surface is kept

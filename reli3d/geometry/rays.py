@@ -30,9 +30,9 @@ class RayScene:
     mesh: a :class:`~reli3d.geometry.mesh.Mesh`, or its vertices ``(V, 3)`` float32 with ``faces (F, 3)`` int32.
     Degenerate faces are never hit; without faces every ray misses.  backend: ``embree`` (CPU, robust mode), ``warp``
     (CPU and CUDA), or ``auto``: Embree on the CPU, where it is about 3 times faster than Warp on incoherent rays, and
-    Warp on CUDA.  :meth:`refit` updates moved vertices.  For vertex gradients, pass
-    ``vertices`` to :meth:`intersect`.  Raises TypeError for a wrong type or dtype; ValueError for a wrong shape, an
-    index out of range, non-finite vertices, or ``embree`` on CUDA.
+    Warp on CUDA.  :meth:`refit` updates moved vertices.  For vertex gradients, pass ``vertices`` to :meth:`intersect`.
+    Raises TypeError for a wrong type or dtype; ValueError for a wrong shape, an index out of range, non-finite
+    vertices, or ``embree`` on CUDA.
 
     >>> scene = reli3d.RayScene(mesh)
     >>> hits = scene.intersect(origins, directions, vertices=mesh.vertices)

@@ -234,11 +234,7 @@ def test_second_derivatives_are_right_or_refused(device, name, of):
 
 
 def fractions_within(case: Case, first, second) -> dict[str, float]:
-    """How many entries of every output and gradient on the device ``second`` are within 1e-3 of those on ``first``.
-
-    On CUDA products and sums are contracted and sums take any order: of the values below a tenth of the median, which
-    are differences of larger ones, 0.1 % are not within 1e-4.
-    """
+    """How many entries of every output and gradient on the device ``second`` are within 1e-4 of those on ``first``."""
     found, results = {}, []
     for device in (first, second):
         leaves = leaves_of(case, device, N)
@@ -250,7 +246,7 @@ def fractions_within(case: Case, first, second) -> dict[str, float]:
         if got.shape != expected.shape:
             found[key] = 0.0
         elif expected.is_floating_point():
-            found[key] = reference.fraction_within(got, expected, 1e-3)
+            found[key] = reference.fraction_within(got, expected)
         else:
             found[key] = float((got == expected.cpu()).double().mean())
     return found
@@ -268,12 +264,16 @@ def test_one_two_and_five_threads_are_bitwise_identical(threads, name):
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
+# differences of nearly equal numbers, whose products and sums CUDA contracts: 0.9987 and 0.99875 on an H100
+CONTRACTED = {("views", "output 5"): 0.998, ("surface_points", "bary"): 0.998}
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_cpu_and_cuda_agree(name):
     if not torch.cuda.is_available():
         pytest.skip("needs CUDA")
     for key, fraction in fractions_within(CASES[name], "cpu", "cuda").items():
-        assert fraction >= 0.999, (key, fraction)
+        assert fraction >= CONTRACTED.get((name, key), 0.999), (key, fraction)
 
 
 def test_no_kernel_is_left_out(monkeypatch):

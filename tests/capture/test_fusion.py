@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -34,20 +36,8 @@ def pictured(k: int, eye: np.ndarray, texture: np.ndarray) -> tuple[View, np.nda
     image = image.reshape(h, w, 3) + np.random.default_rng(k).normal(0, 3, (h, w, 3))
     photo = Photo(str(k), image.clip(0, 255).astype(np.uint8), None, ())
     mask = ball.reshape(h, w)
-    return (
-        View(
-            photo,
-            camera.rotation,
-            camera.translation,
-            camera.focal,
-            camera.principal,
-            0.0,
-            camera.pixels,
-            camera.points,
-        ),
-        mask,
-        (on_plane & (np.linalg.norm(at - 200, axis=1) < SHADOW)).reshape(h, w),
-    )
+    shadow = on_plane & (np.linalg.norm(at - 200, axis=1) < SHADOW)
+    return replace(camera, photo=photo), mask, shadow.reshape(h, w)
 
 
 def gray_scene(*, shadow: float = 1.0):
