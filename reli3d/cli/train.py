@@ -22,10 +22,10 @@ LIGHT_PRIOR = "light_prior"
 SIDES = 64, 128, 256  # of the images of stage pixels
 CALIBRATED = 5  # least views of a sample for calibration: four are input, one is compared
 OF_LOOP = ("steps", "minutes", "batch", "rate", "seed", "save_every", "tensorboard")
-OF_NETWORK = ("weights", "validation", "export", "license", "max_views", "bfloat16")
+OF_NETWORK = ("weights", "validation", "export", "license", "max_views", "bfloat16", "device")
 OF_SMALL = (*OF_NETWORK, "points", "pyramid_rate", "maps", "material_bins")
 OF_CONFIG = ("image_size", "patch", "targets", "lobes", "resolution", "samples", "shadows")  # of a StageConfig
-OF_PAPER = (*OF_NETWORK, *OF_CONFIG, "preset", "prior", "perceptual", "checkpointing", "shard", "device")
+OF_PAPER = (*OF_NETWORK, *OF_CONFIG, "preset", "prior", "perceptual", "checkpointing", "shard")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -68,6 +68,7 @@ def parser() -> argparse.ArgumentParser:
     loop.add_argument("--seed", type=int)
     loop.add_argument("--save-every", type=int, metavar="STEPS")
     loop.add_argument("--bfloat16", action="store_true", help="compute the convolutions or the trunk in bfloat16")
+    loop.add_argument("--device", choices=("cpu", "cuda"))
     loop.add_argument("--tensorboard", type=Path, metavar="DIR", help="also write event files to this folder")
     small = p.add_argument_group("stages pixels and small")
     small.add_argument("--points", type=int, help="volume points per object")
@@ -93,7 +94,6 @@ def parser() -> argparse.ArgumentParser:
     paper.add_argument("--perceptual", choices=("gradients", "lpips"))
     paper.add_argument("--checkpointing", action="store_true", help="recompute the trunk's layers in the backward pass")
     paper.add_argument("--shard", action="store_true", help="divide the trunk among the processes of torchrun (FSDP)")
-    paper.add_argument("--device", choices=("cpu", "cuda"))
     for name in ("patch", "targets", "lobes", "resolution"):
         paper.add_argument(f"--{name}", type=int)
     paper.add_argument("--samples", type=int, nargs=3, metavar=("LIGHT", "NORMALS", "COSINE"))
@@ -157,7 +157,18 @@ def small_stage(args: argparse.Namespace) -> Stage:
     finest = SIDES[::-1].index(side) if pixels else 0
     model = reduced_model(model, finest).train() if finest else model
     names = ("seed", "max_views", "points", "pyramid_rate", "bfloat16", "maps", "validation")
-    return (PixelStage if pixels else SmallStage)(model, args.data, **given(args, *names))
+    device = device_of(args)
+    return (PixelStage if pixels else SmallStage)(model, args.data, device=device, **given(args, *names))
+
+
+def device_of(args: argparse.Namespace) -> str:
+    """The device of ``--device``, the CPU by default.  Raises InputError where there is none."""
+    import torch
+
+    device = getattr(args, "device", "cpu")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device", "expected a CUDA device, got none; leave it out to train on the CPU")
+    return device
 
 
 def small_network(start: str | None, resumed: Path) -> LocalReconstructor:
@@ -198,7 +209,6 @@ def light_prior_stage(args: argparse.Namespace) -> Stage:
 
 def paper_stage(args: argparse.Namespace) -> Stage:
     """A stage of the paper's network."""
-    import torch
 
     from reli3d.nn.model import Reconstructor
     from reli3d.nn.presets import OFFICIAL, TINY
@@ -214,9 +224,7 @@ def paper_stage(args: argparse.Namespace) -> Stage:
         raise InputError("--stage", f"expected {known} for preset {preset.name}, got {args.stage}")
     if not args.data and "export" not in args:
         raise InputError("data", "expected folders of samples, captures or shards, got none")
-    device = getattr(args, "device", "cpu")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device", "expected a CUDA device, got none; leave it out to train on the CPU")
+    device = device_of(args)
     numbers = given(args, *OF_CONFIG)
     if "samples" in numbers:
         numbers["samples"] = tuple(numbers["samples"])

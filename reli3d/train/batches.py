@@ -78,13 +78,21 @@ class Sample(TrainingViews):
 
 
 def load_sample(
-    path: Path, views: int, points: int, rng: np.random.Generator, *, augment: bool = True, lights: Tensor | None = None
+    path: Path,
+    views: int,
+    points: int,
+    rng: np.random.Generator,
+    *,
+    augment: bool = True,
+    lights: Tensor | None = None,
+    device: torch.device | str = "cpu",
 ) -> Sample:
     """Reads up to ``views`` random views of a file, ``points`` volume points and half as many surface points.
 
     augment: False takes the first views unchanged.  lights: ``(n, H, 2H, 3)``, for relighting some of the samples.
+    device: of the sample and of the relighting.
     """
-    with safe_open(path, "pt") as file:
+    with safe_open(path, "pt", device=str(device)) as file:
         total = file.get_slice("c2w").get_shape()[0]
         order = rng.permutation(total)[:views] if augment else np.arange(min(views, total))
         chosen = order.tolist()
@@ -115,9 +123,9 @@ def load_sample(
         material, of_pixels = finish.apply(material), finish.apply(of_pixels)
         images, light = relight_views(images, of_pixels, normal, valid, c2w, intrinsics, draw_light(lights, rng), rng)
     turn = random_turn(rng) if augment else torch.eye(3)
-    flip = torch.tensor([-1.0 if augment and rng.random() > UNCHANGED_PROBABILITY else 1.0, 1.0, 1.0])
-    turn = turn * flip  # a mirror at the plane x = 0, then the turn
-    mirrored = bool(flip[0] < 0)
+    mirrored = augment and rng.random() > UNCHANGED_PROBABILITY
+    flip = torch.tensor([-1.0 if mirrored else 1.0, 1.0, 1.0])
+    turn = (turn * flip).to(device)  # a mirror at the plane x = 0, then the turn
     if mirrored:
         images, of_pixels, normal, depth, valid = (t.flip(2) for t in (images, of_pixels, normal, depth, valid))
         intrinsics = intrinsics.clone()
@@ -127,13 +135,14 @@ def load_sample(
     if mirrored:
         c2w[:, :, 0] *= -1  # the camera stays right-handed, its image is flipped
     if augment and rng.random() > UNCHANGED_PROBABILITY:
-        channels = torch.as_tensor(rng.permutation(3))
+        channels = torch.as_tensor(rng.permutation(3), device=device)
         images = torch.cat([images[..., channels], images[..., 3:]], -1)
         light, material = light[..., channels], torch.cat([material[:, channels], material[:, 3:]], -1)
         of_pixels = torch.cat([of_pixels[..., channels], of_pixels[..., 3:]], -1)
     color, masks = images[..., :3], images[..., 3]
     if augment:
-        noise = torch.from_numpy(rng.standard_normal(color.shape, dtype=np.float32))
+        source = torch.Generator(device).manual_seed(int(rng.integers(1 << 62)))
+        noise = torch.randn(color.shape, generator=source, device=device)
         color = (color + float(rng.random()) * MAX_NOISE * noise).clamp(0, 1)
     whole = functional.avg_pool2d(valid.float()[:, None], 2)[:, 0]
     fraction = whole.clamp(min=0.25)[..., None]
@@ -159,7 +168,7 @@ def load_sample(
         surface=surface @ turn.T,
         material=material,
         visible=visible,
-        light_directions=lat_long_directions(light.shape[0]).reshape(-1, 3) @ turn.T,
+        light_directions=lat_long_directions(light.shape[0], device=device).reshape(-1, 3) @ turn.T,
         light=light.reshape(-1, 3),
     )
 
@@ -171,13 +180,14 @@ def draw_samples(
     points: int,
     max_views: int,
     lights: Tensor | None = None,
+    device: torch.device | str = "cpu",
 ) -> list[Sample]:
-    """For each of ``seeds`` a random object of ``files`` with 1 to ``max_views`` random views."""
+    """For each of ``seeds`` a random object of ``files`` with 1 to ``max_views`` random views, on ``device``."""
     drawn = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
         file, views = files[int(rng.integers(len(files)))], int(rng.integers(1, max_views + 1))
-        drawn.append(load_sample(file, views, points, rng, lights=lights))
+        drawn.append(load_sample(file, views, points, rng, lights=lights, device=device))
     return drawn
 
 

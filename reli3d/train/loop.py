@@ -64,10 +64,11 @@ def accumulate(stage: Stage, items: Sequence[Any]) -> Tensor:
         terms = stage.losses(item)
         loss = reduce(torch.add, [stage.weights[name] * value for name, value in terms.items()])
         (loss / len(items)).backward()
-        for name, value in terms.items():
-            values[names.index(name)] += float(value.detach())
+        *of_terms, of_item = torch.stack([*terms.values(), loss]).detach().double().tolist()
+        for name, value in zip(terms, of_terms, strict=True):
+            values[names.index(name)] += value
             values[len(names) + names.index(name)] += 1
-        values[-2] += float(loss.detach())
+        values[-2] += of_item
         values[-1] += 1
     return values
 

@@ -101,9 +101,9 @@ def reduction(path: Path, finest: int) -> int:
     return max(1, (size << finest) // FULL_SIDE)
 
 
-def read_views_reduced(path: Path, factor: int) -> TrainingViews:
-    """All views of a sample, reduced by ``factor``."""
-    with safe_open(path, "pt") as file:
+def read_views_reduced(path: Path, factor: int, device: torch.device | str = "cpu") -> TrainingViews:
+    """All views of a sample, reduced by ``factor``, on ``device``."""
+    with safe_open(path, "pt", device=str(device)) as file:
         images, material, normal, depth, c2w, intrinsics = (
             file.get_tensor(name).float()
             for name in ("images", "view_material", "view_normal", "view_depth", "c2w", "intrinsics")
@@ -135,12 +135,13 @@ def read_views_reduced(path: Path, factor: int) -> TrainingViews:
 
 def augmented(views: TrainingViews, rng: np.random.Generator) -> TrainingViews:
     """``views`` in random order, randomly mirrored, with permuted color channels and noise."""
-    views = views.of_views(torch.as_tensor(rng.permutation(len(views.masks))))
+    device = views.images.device
+    views = views.of_views(torch.as_tensor(rng.permutation(len(views.masks)), device=device))
     changed = {}
     if rng.random() > UNCHANGED_PROBABILITY:
         maps = ("images", "masks", "silhouette", "view_material", "view_normal", "view_depth", "view_valid")
         views = replace(views, **{name: getattr(views, name).flip(2).contiguous() for name in maps})
-        flip = torch.tensor([-1.0, 1.0, 1.0])
+        flip = torch.tensor([-1.0, 1.0, 1.0], device=device)
         c2w, intrinsics = views.c2w.clone(), views.intrinsics.clone()
         c2w[:, :3] *= flip[:, None]
         c2w[:, :, 0] *= -1  # the camera stays right-handed, its image is flipped
@@ -148,23 +149,25 @@ def augmented(views: TrainingViews, rng: np.random.Generator) -> TrainingViews:
         changed = {"c2w": c2w, "intrinsics": intrinsics, "view_normal": views.view_normal * flip}
     color, material = views.images, views.view_material
     if rng.random() > UNCHANGED_PROBABILITY:
-        channels = torch.as_tensor(rng.permutation(3))
+        channels = torch.as_tensor(rng.permutation(3), device=device)
         color, material = color[..., channels], torch.cat([material[..., channels], material[..., 3:]], -1)
-    noise = torch.from_numpy(rng.standard_normal(color.shape, dtype=np.float32))
+    source = torch.Generator(device).manual_seed(int(rng.integers(1 << 62)))
+    noise = torch.randn(color.shape, generator=source, device=device)
     color = (color + float(rng.random()) * MAX_NOISE * noise).clamp(0, 1).contiguous()
     return replace(views, images=color, view_material=material.contiguous(), **changed)
 
 
 class ViewCache:
-    """Views of samples at the resolution of level ``finest``; caches up to CACHE_BYTES."""
+    """Views of samples at the resolution of level ``finest``, on ``device``; caches up to CACHE_BYTES."""
 
-    def __init__(self, finest: int):
+    def __init__(self, finest: int, device: torch.device | str = "cpu"):
+        self.device = device
         self.finest, self._kept, self._bytes = finest, dict[Path, TrainingViews](), 0
 
     def __getitem__(self, path: Path) -> TrainingViews:
         if path in self._kept:
             return self._kept[path]
-        views = read_views_reduced(path, reduction(path, self.finest))
+        views = read_views_reduced(path, reduction(path, self.finest), self.device)
         if self._bytes < CACHE_BYTES:
             self._kept[path] = views
             self._bytes += sum(getattr(views, f.name).nbytes for f in fields(views))

@@ -79,6 +79,7 @@ def relight_views(
     :mod:`reli3d.synthetic.samples`.  Without shadows: the G-buffers have no geometry behind other surfaces.
     """
     views, size = images.shape[:2]
+    light = light.to(images.device)
     environment = Environment(light.contiguous())
     directions = torch.stack([camera_rays(Camera(c2w[k], intrinsics[k], size, size))[1] for k in range(views)])
     directions = directions.reshape(views, size, size, 3)
@@ -93,7 +94,7 @@ def relight_views(
     first_view = int(valid[0].sum()) or len(radiance)
     bright = float(radiance[:first_view].mean(-1).quantile(0.9))
     exposure = EXPOSURE_TARGET / max(bright, 1e-3) * float(np.exp(rng.normal(0, EXPOSURE)))
-    surface = torch.zeros(views, size, size, 4)
+    surface = images.new_zeros(views, size, size, 4)
     surface[valid] = functional.pad(radiance, (0, 1), value=1.0)
     around = functional.avg_pool2d(surface.permute(0, 3, 1, 2), 3, 1, 1).permute(0, 2, 3, 1)  # for pixels of the edge
     surface = torch.where(valid[..., None], surface[..., :3], around[..., :3] / around[..., 3:].clamp(min=1e-3))

@@ -24,9 +24,11 @@ class Workers:
         """Joins the process group of torchrun; a group of one process without torchrun."""
         if "RANK" not in os.environ:
             return Workers()
-        if torch.cuda.is_available():
-            torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)) % torch.cuda.device_count())
-        distributed.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+        devices, here = torch.cuda.device_count(), int(os.environ.get("LOCAL_WORLD_SIZE", 1))
+        if devices:
+            torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)) % devices)
+        # NCCL needs a device for each process
+        distributed.init_process_group("cpu:gloo,cuda:nccl" if devices >= here else "gloo")
         return Workers(distributed.get_rank(), distributed.get_world_size())
 
     def average(self, parameters: Sequence[Tensor], values: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from reli3d.nn.weights import load_model
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.latlong import lat_long_directions
 from reli3d.train import checkpoint
-from reli3d.train.batches import draw_samples, random_turn
+from reli3d.train.batches import draw_samples, load_sample, random_turn
 from reli3d.train.light_prior import LightPriorStage
 from reli3d.train.loop import parameter_groups, progress, rate_at, train
 from reli3d.train.losses import (
@@ -44,6 +44,26 @@ def drawn(folder, seeds, *, points, max_views):
 @pytest.fixture(scope="module")
 def samples(folder):
     return drawn(folder, (1, 2), points=512, max_views=2)
+
+
+def test_losses_and_gradients_on_each_device_equal_those_on_the_cpu(folder, device):
+    file, found = sorted(folder.glob("*.safetensors"))[0], []
+    for place in (torch.device("cpu"), device):
+        stored = load_sample(file, 2, 256, np.random.default_rng(0), augment=False, device=place)
+        model = load_model("small").to(place).train().requires_grad_(True)
+        assert stored.images.device == stored.light.device == place
+        field = encode_sample(model, stored)
+        field.free_sdf(stored.points).square().mean().backward()
+        found.append((field.log_light.detach().cpu(), model.volume.out.weight.grad.cpu()))
+    for got, expected in zip(*found, strict=True):
+        assert float((got - expected).norm() / expected.norm()) < 0.01  # TF32: 10 bits of the mantissa
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+@pytest.mark.parametrize("stage", ["small", "pixels", "volume"])
+def test_cuda_is_not_replaced_by_the_cpu(folder, tmp_path, capsys, stage):
+    assert main([str(folder), str(tmp_path / "run"), "--stage", stage, "--device", "cuda"]) == 2
+    assert "expected a CUDA device" in capsys.readouterr().err
 
 
 def test_surface_points_lie_in_every_silhouette(samples):
