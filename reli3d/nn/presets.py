@@ -14,6 +14,7 @@ import math
 import typing
 from dataclasses import dataclass
 
+CALIBRATED_VIEWS = 4  # largest number of views at which surface offsets are calibrated
 MAX_SIZE, MAX_LAYERS, MAX_LEVELS = 8192, 64, 8  # several times the values of the presets
 LAYERS = ("layers", "blocks", "basic_blocks", "convolutions")
 LIMITS = {  # inclusive; all other integers lie in 1 to MAX_SIZE
@@ -191,7 +192,8 @@ class LocalPreset(_Checked):
     radius: float = 0.87  # half side of the model's cube
     softness: float = 0.02  # unit of the signed distance: occupancy is sigmoid(-distance / softness)
     offset_one_view: float = 0.0  # outward offset of the surface, in units of softness; see reli3d.train.calibrate
-    offset_many_views: float = 0.0  # the same in the limit of many views; in between by the inverse of their number
+    # with V views: linear in 1 / min(V, CALIBRATED_VIEWS) between the offset of one view and this limit of 1 / V = 0
+    offset_many_views: float = 0.0
     smoothing: int = 8  # iterations of Taubin smoothing of the extracted surface
 
     def __post_init__(self):

@@ -1,4 +1,4 @@
-"""Calibration of the occupancy logit, by silhouettes in held-out views.
+"""Calibration of the occupancy logit, by normal maps in held-out views.
 
 An uncertain network predicts occupancies below 0.5 at the true surface, which makes shapes too thin.  A constant added
 to the logit compensates.  Uncertainty depends on the number of views, so one and four views have separate constants.
@@ -15,21 +15,23 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 from torch import Tensor
+from torch.nn import functional
 
+from reli3d._bridge import present
 from reli3d.errors import InputError
 from reli3d.geometry.camera import Camera, camera_rays
+from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
-from reli3d.nn.presets import LocalPreset
+from reli3d.nn.presets import CALIBRATED_VIEWS, LocalPreset
 from reli3d.pipeline import Network, NoSurface, encode, extract, prepare
 from reli3d.train.batches import stored_views
 from reli3d.views.similarity import Similarity
 
-OFFSETS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0)  # candidates; the last gives about the visual hull
-FEW_VIEWS, MANY_VIEWS = 1, 4  # numbers of views that are tried
-SILHOUETTE_SIZE = 96  # pixels of the silhouettes that are compared
-MIN_RATIO_DIFFERENCE = 1e-3  # of 1 / recall - precision: a few pixels in a silhouette of several thousand
-MAX_MISMATCH = math.log(20.0)  # that of a recall of 1/20
+OFFSETS = (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0)  # candidates; the last gives about the visual hull
+FEW_VIEWS, MANY_VIEWS = 1, CALIBRATED_VIEWS  # numbers of views that are tried
+COMPARED_SIZE = 96  # pixels of the normal maps that are compared
+MIN_ERROR, MAX_ERROR = 1e-3, math.log(20.0)  # of a normal map: 2 degrees everywhere; a mesh of 20 times the area
 
 
 @torch.no_grad()
@@ -41,7 +43,7 @@ def calibrate(
     seed: int = 1,
     progress: Callable[[str], None] = lambda line: None,
 ) -> dict[int, dict[float, float]]:
-    """Sets the surface offsets of the preset by :func:`mismatch` over random ``samples``.
+    """Sets the surface offsets of the preset by :func:`normal_map_error` over random ``samples``.
 
     Of the candidates OFFSETS it takes the smallest that :func:`one_standard_error_choice` cannot distinguish from the
     best.  Returns the mean silhouette IoU of every offset, for each number of views.
@@ -67,9 +69,9 @@ def calibrate(
                 model.preset = replace(preset, offset_one_view=offset, offset_many_views=offset)
                 try:
                     mesh = extract(field, preset.resolution)
-                    rows[-1].append(silhouette_scores(mesh, sample, range(count, len(sample["images"]))))
+                    rows[-1].append(view_scores(mesh, sample, range(count, len(sample["images"]))))
                 except NoSurface:
-                    rows[-1].append((0.0, MAX_MISMATCH))
+                    rows[-1].append((0.0, MAX_ERROR))
         progress(f"{files[k].stem}: IoU {max(scores[FEW_VIEWS][-1])[0]:.3f}, {max(scores[MANY_VIEWS][-1])[0]:.3f}")
     found = {count: np.array(rows) for count, rows in scores.items()}  # (objects, offsets, 2)
     tried = {count: dict(zip(OFFSETS, rows[..., 0].mean(0).tolist(), strict=True)) for count, rows in found.items()}
@@ -87,28 +89,37 @@ def one_standard_error_choice(errors: np.ndarray) -> int:
     return int(np.flatnonzero(more.mean(0) <= noise)[0])
 
 
-def silhouette_scores(mesh: Mesh, sample: dict[str, Tensor], views: range) -> tuple[float, float]:
-    """Mean IoU and mean :func:`mismatch` between silhouettes of ``mesh`` and the masks of ``sample`` in ``views``."""
+def view_scores(mesh: Mesh, sample: dict[str, Tensor], views: range) -> tuple[float, float]:
+    """Mean silhouette IoU and mean :func:`normal_map_error` of ``mesh`` in ``views`` of ``sample``."""
     scene, size = RayScene(mesh.vertices, mesh.faces), sample["images"].shape[1]
-    step = size // SILHOUETTE_SIZE
+    normals = present("mesh.normals", mesh.normals)
+    step = size // COMPARED_SIZE
     rows = []
     for v in views:
         intrinsics = sample["intrinsics"][v] / step
         origins, directions = camera_rays(Camera(sample["c2w"][v], intrinsics, size // step, size // step))
-        filled = scene.closest(origins, directions).face >= 0
-        alpha = sample["images"][v, ..., 3].float()[None, None]
-        masked = torch.nn.functional.avg_pool2d(alpha, step)[0, 0] > 127.5
-        both = int((filled & masked).sum())
-        rows.append((both / max(int((filled | masked).sum()), 1), mismatch(both, int(filled.sum()), int(masked.sum()))))
+        hits = scene.closest(origins.reshape(-1, 3), directions.reshape(-1, 3))
+        filled, masked = hits.face >= 0, _reduced(sample["images"][v, ..., 3:], step)[:, 0] > 127.5
+        got = interpolate(normals, mesh.faces, hits.face, hits.bary)
+        wanted = _reduced(sample["view_normal"][v], step)
+        unknown = masked & (wanted == 0.0).all(-1)  # at the outline: only whether the mesh is there counts
+        wanted[unknown] = torch.where(filled[unknown, None], got[unknown], torch.tensor([0.0, 0.0, 1.0]))
+        both, either = int((filled & masked).sum()), int((filled | masked).sum())
+        rows.append((both / max(either, 1), normal_map_error(got, filled, wanted, masked)))
     return tuple(np.mean(rows, 0).tolist())
 
 
-def mismatch(both: int, filled: int, masked: int) -> float:
-    """``log(1 / recall - precision)`` of silhouettes of ``filled`` and ``masked`` pixels with ``both`` in common.
+def _reduced(values: Tensor, step: int) -> Tensor:
+    """Means ``(P, C)`` over squares of ``step`` pixels of ``values (H, W, C)``."""
+    return functional.avg_pool2d(values.float().permute(2, 0, 1), step).flatten(1).T
 
-    Equals the logarithm of the squared error per common pixel of an image of constant color at its optimal brightness.
-    Unlike IoU it penalizes missing area more than excess area.  At most MAX_MISMATCH.
+
+def normal_map_error(got: Tensor, filled: Tensor, wanted: Tensor, masked: Tensor) -> float:
+    """Squared error of a normal map over the area of the object, as a logarithm; at most MAX_ERROR.
+
+    got, wanted: normals ``(P, 3)`` of any length.  filled, masked: ``(P,)`` bool, the pixels of the mesh and of the
+    object; both maps are zero elsewhere, so that a pixel of only one of them has the error 1.
     """
-    if both == 0:
-        return MAX_MISMATCH
-    return min(MAX_MISMATCH, math.log(max(masked / both - both / filled, MIN_RATIO_DIFFERENCE)))
+    got, wanted = functional.normalize(got, dim=-1), functional.normalize(wanted, dim=-1)
+    difference = (got * filled[:, None] - wanted * masked[:, None]).square().sum()
+    return min(MAX_ERROR, math.log(max(float(difference) / max(int(masked.sum()), 1), MIN_ERROR)))

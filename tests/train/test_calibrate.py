@@ -1,6 +1,7 @@
 """Calibration restores the part of a surface that training removes."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from reli3d.geometry.distance import signed_distance
 from reli3d.nn.local import LocalField, LocalReconstructor
 from reli3d.nn.presets import SMALL
 from reli3d.synthetic.procedural import make_object
-from reli3d.train.calibrate import MAX_MISMATCH, MIN_RATIO_DIFFERENCE, calibrate, mismatch, one_standard_error_choice
+from reli3d.train.calibrate import MAX_ERROR, MIN_ERROR, calibrate, normal_map_error, one_standard_error_choice
 from tests.support.stages import SEEDS
 
 
@@ -47,17 +48,17 @@ def test_calibration_restores_the_missing_part(folder, tmp_path):
         calibrate(model, tmp_path / "none")
 
 
-def test_mismatch_is_the_error_of_an_image_in_one_color_at_its_best_brightness():
-    rng = np.random.default_rng(0)
-    for fraction in (0.1, 0.5, 0.9):
-        expected = rng.random(5000) < 0.4
-        got = np.where(rng.random(5000) < fraction, expected, rng.random(5000) < 0.5)
-        both = (expected & got).sum()
-        _, residual, _, _ = np.linalg.lstsq(got[:, None].astype(float), expected.astype(float), rcond=None)
-        value = mismatch(int(both), int(got.sum()), int(expected.sum()))
-        assert abs(value - np.log(residual[0] / both)) < 1e-9
-    assert mismatch(0, 10, 10) == mismatch(1, 1000, 1000) == MAX_MISMATCH
-    assert mismatch(10, 10, 10) == np.log(MIN_RATIO_DIFFERENCE)
+def test_the_error_of_a_normal_map_is_its_squared_difference_over_the_area_of_the_object():
+    """Two overlapping intervals with an angle between their normals: in the overlap |a - b|^2, elsewhere 1."""
+    column = torch.arange(1000)
+    filled, masked = column < 600, (column >= 100) & (column < 800)
+    angle = torch.tensor(0.4, dtype=torch.float64)
+    got, wanted = torch.tensor([[0.0, 0.0, 2.0]]), torch.stack([angle.sin(), 0 * angle, angle.cos()])[None].float()
+    value = normal_map_error(got.expand(1000, 3), filled, wanted.expand(1000, 3), masked)
+    expected = (500 * (2 - 2 * math.cos(0.4)) + 100 + 200) / 700
+    assert abs(value - math.log(expected)) < 1e-5  # float32 sums
+    assert normal_map_error(wanted, filled[100:101], wanted, masked[100:101]) == math.log(MIN_ERROR)
+    assert normal_map_error(got.expand(1000, 3), column < 900, wanted.expand(1000, 3), column < 20) == MAX_ERROR
 
 
 def test_the_first_choice_within_a_standard_error_of_the_best_is_taken():
