@@ -18,7 +18,8 @@ from reli3d.capture.mapping import Map, View
 from reli3d.capture.masks import COARSE_SIDE, full_size, grabcut, reduced, refined
 from reli3d.capture.scene import Scene
 
-TEXEL = 1.5  # pixels at COARSE_SIDE, at the cameras' median distance
+SIDES = COARSE_SIDE, COARSE_SIDE, 720  # pixels along the longer side of the images, in each pass
+TEXEL = 1.5  # pixels of the images, at the cameras' median distance
 ROWS, GAIN_STEP = 64, 4  # texels: rows at a time; gains are compared at every fourth in both directions
 TEXTURE_REACH = 0.9  # of the cameras' median distance: half the side of the textured square
 FEWEST_SAMPLES = 4  # views that show a texel
@@ -32,10 +33,10 @@ SHADOWS = 0.05  # fraction of the plane's pixels that do not look like its textu
 COMPONENTS, COLOR_NOISE, COLOR_SAMPLES = 5, 2.0, 3000  # of a mixture of Gaussians; of 255; pixels
 LOWEST_DENSITY = -23.0  # logarithm of a density of colors, per 1 / 255^3
 PLANE_EVIDENCE, COLOR_EVIDENCE = 4.0, 1.5  # largest log odds of a pixel, before the plane and elsewhere
-COVERED = 0.5  # probability that a pixel shows the object although a point behind or before it is empty
-GRIDS = 64, 96  # cells along the volume's side, first and last
+COVERED = 0.85  # probability that a pixel shows the object although a point near it on the same ray is empty
+GRIDS = 64, 96, 96  # cells along the volume's side, in each pass
 LEAST_SEEN = 0.5  # fraction of the views that must show a cell
-VOLUME_SIDE = 2.0, 1.15  # sides of the volume over those of the object so far, first and last
+VOLUME_SIDE = 2.0, 1.15, 1.15  # sides of the volume over those of the object so far, in each pass
 PRIOR_INSIDE, PRIOR_OUTSIDE = 3.0, 6.0  # largest log odds by the distance in pixels from the volume's silhouette
 SHADOW_HEIGHT = 0.1, 0.4  # of the object's longest side and of its height: lower cells may be a shadow on the plane
 CERTAIN = 3.0  # log odds from which GrabCut keeps a pixel
@@ -44,7 +45,7 @@ LIMIT_PIXELS = 12  # around the silhouette: farther out nothing is the object
 
 @dataclass(frozen=True)
 class _Small:
-    """A view with its image at COARSE_SIDE."""
+    """A view with its image at one of SIDES."""
 
     view: View
     image: np.ndarray  # (H, W, 3) uint8
@@ -69,19 +70,24 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     The log odds of a pixel, object over background, compare a mixture of Gaussians of the object's colors with the
     plane's texture, or elsewhere with the colors around the object.  Of each cell of a volume they give the log odds
     that it is occupied (Franco and Boyer 2005): one view that sees the background through a cell empties it, and all
-    have to agree on an occupied one.  In the second pass the texture is that of all views in which no cell above
+    have to agree on an occupied one.  From the second pass on the texture is that of all views in which no cell above
     SHADOW_HEIGHT covers it: a contact shadow, which the first masks include, becomes a part of the texture.  The
-    volume's silhouettes are added to the log odds of the pixels, and GrabCut starts there.
+    volume's silhouettes are added to the log odds of the pixels, and GrabCut starts there.  The last pass has larger
+    images, so that texture and evidence resolve the outline.
     """
     if scene.plane is None:
         return masks
     axes = _Axes(scene.plane.foot(scene.center), scene.plane.axes)
-    smalls = [_Small(v, *reduced(v.photo.pixels, COARSE_SIDE)) for v in found.views if v.photo.name in masks]
-    inside = [full_size(masks[s.view.photo.name], s.image.shape) > 127 for s in smalls]
+    views = [v for v in found.views if v.photo.name in masks]
+    inside = [masks[v.photo.name] for v in views]
     points = (found.points[scene.object] - axes.origin) @ axes.axes.T
     box = np.stack([np.minimum(points.min(0), [np.inf, np.inf, 0]), points.max(0)])
     cover = inside
-    for cells, growth in zip(GRIDS, VOLUME_SIDE, strict=True):
+    for side, cells, growth in zip(SIDES, GRIDS, VOLUME_SIDE, strict=True):
+        smalls = [_Small(v, *reduced(v.photo.pixels, side)) for v in views]
+        inside, cover = (
+            [full_size(m, s.image.shape) > 127 for m, s in zip(x, smalls, strict=True)] for x in (inside, cover)
+        )
         texture = _plane_texture(smalls, cover, axes, scene)
         expected = [_expected(texture, axes, s) for s in smalls]
         evidence = _evidence(smalls, inside, expected)
@@ -93,10 +99,9 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
         occupied = occupied @ axes.axes + axes.origin
         cover = [_silhouette(s, occupied[high], cell) for s in smalls]
         inside = [_segmented(s, e, occupied, cell) for s, e in zip(smalls, evidence, strict=True)]
-    pixels = [(s.view.photo.name, s.view.photo.pixels) for s in smalls]
+    photos = [(v.photo.name, v.photo.pixels) for v in views]
     return {
-        name: full_size(refined(image, mask.astype(np.uint8) * 255), image.shape)
-        for (name, image), mask in zip(pixels, inside, strict=True)
+        name: full_size(refined(image, mask), image.shape) for (name, image), mask in zip(photos, inside, strict=True)
     }
 
 
@@ -159,7 +164,7 @@ def _gain(color: np.ndarray, reference: np.ndarray) -> np.ndarray:
 class _Expected:
     """The plane as a view shows it: lowest and highest color ``(H, W, 3)`` within a pixel, and spread ``(H, W)``."""
 
-    low: np.ndarray
+    low: np.ndarray  # uint8, as `high`
     high: np.ndarray
     spread: np.ndarray
     known: np.ndarray  # (H, W) bool
@@ -178,7 +183,7 @@ def _expected(texture: _Texture, axes: _Axes, small: _Small) -> _Expected:
     hit = (eye[:2] + along[:, None] * rays[:, :2]) / texture.cell + len(texture.color) / 2 - 0.5
     hit[along <= 0] = -10
     u, v = hit.T.astype(np.float32).reshape(2, h, w)
-    color = cv2.remap(texture.color, u, v, cv2.INTER_LINEAR)
+    color = np.rint(cv2.remap(texture.color, u, v, cv2.INTER_LINEAR)).astype(np.uint8)
     spread = cv2.remap(texture.spread, u, v, cv2.INTER_LINEAR, borderValue=10 * MOST_SPREAD)
     window = np.ones((3, 3), np.uint8)
     known = spread < MOST_SPREAD
@@ -229,7 +234,7 @@ def _log_odds(image: np.ndarray, inside: np.ndarray, plane: _Expected, own: _Col
     near, around = (cv2.dilate(inside.astype(np.uint8), np.ones((k, k), np.uint8)) > 0 for k in NEAR_AND_AROUND)
     sample, gain = ~near & plane.known, np.ones(3)
     if sample.sum() > FEWEST_PIXELS:
-        middle = (plane.low + plane.high)[sample] / 2
+        middle = (plane.low[sample] + plane.high[sample].astype(float)) / 2
         gain = np.median(image[sample] / np.maximum(middle, DARKEST), 0)
     context = around & ~near
     other = _Colors(image[context if context.sum() > FEWEST_PIXELS else ~inside]).log_density(image)
@@ -238,7 +243,7 @@ def _log_odds(image: np.ndarray, inside: np.ndarray, plane: _Expected, own: _Col
     as_plane = np.logaddexp(np.log(1 - SHADOWS) + as_plane, np.log(SHADOWS) + other)
     odds = own.log_density(image) - np.where(plane.known, as_plane, other)
     limit = np.where(plane.known, PLANE_EVIDENCE, COLOR_EVIDENCE)
-    return np.clip(cv2.GaussianBlur(np.clip(odds, -8, 8), (0, 0), 1.2), -limit, limit)
+    return np.clip(cv2.GaussianBlur(np.clip(odds, -8, 8), (0, 0), 1.2), -limit, limit).astype(np.float32)
 
 
 def _shown(pixels: np.ndarray, depth: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -277,11 +282,11 @@ def _occupied(smalls, evidence, axes: _Axes, box, points, cells: int, growth: fl
 
 
 def _silhouette(small: _Small, centers: np.ndarray, cell: float) -> np.ndarray:
-    """``(H, W)`` uint8, 1 where the view shows the cells of size ``cell`` about ``centers (N, 3)``."""
+    """``(H, W)`` uint8, 255 where the view shows the cells of size ``cell`` about ``centers (N, 3)``."""
     pixels, depth = small.project(centers)
     x, y, shown = _shown(pixels, depth, small.image.shape)
     silhouette = np.zeros(small.image.shape[:2], np.uint8)
-    silhouette[y, x] = 1
+    silhouette[y, x] = 255
     if len(x) == 0:
         return silhouette
     width = int(np.ceil(small.view.focal * small.scale * cell / np.median(depth[shown]))) + 2
@@ -289,14 +294,15 @@ def _silhouette(small: _Small, centers: np.ndarray, cell: float) -> np.ndarray:
 
 
 def _segmented(small: _Small, evidence: np.ndarray, occupied: np.ndarray, cell: float) -> np.ndarray:
-    """Mask ``(H, W)`` by GrabCut, which starts from the evidence and the silhouette of the occupied cells."""
+    """Mask ``(H, W)`` uint8 by GrabCut, which starts from the evidence and the silhouette of the occupied cells."""
     closed = _silhouette(small, occupied, cell)
     if not closed.any():
-        return closed > 0
-    away = cv2.distanceTransform(closed, cv2.DIST_L2, 3) - cv2.distanceTransform(1 - closed, cv2.DIST_L2, 3)
+        return closed
+    away = cv2.distanceTransform(closed, cv2.DIST_L2, 3) - cv2.distanceTransform(255 - closed, cv2.DIST_L2, 3)
+    away += 0.5 * small.view.focal * small.scale * cell / np.median(small.project(occupied)[1])  # cells, not centers
     odds = evidence + np.clip(away, -PRIOR_OUTSIDE, PRIOR_INSIDE)
     labels = np.where(odds > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[odds > CERTAIN], labels[odds < -CERTAIN] = cv2.GC_FGD, cv2.GC_BGD
     limit = (away > -LIMIT_PIXELS).astype(np.uint8)
     labels[limit == 0] = cv2.GC_BGD
-    return grabcut(small.image, labels, limit) > 0
+    return grabcut(small.image, labels, limit)
