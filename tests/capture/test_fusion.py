@@ -68,9 +68,7 @@ def test_masks_that_lack_half_of_a_gray_object_are_completed():
         masks[v.photo.name] = half.astype(np.uint8) * 255
     result = fused_masks(found, scene, masks)
     iou = [(r & t).sum() / (r | t).sum() for t, r in ((t, result[v.photo.name] > 127) for v, t, _ in pairs)]
-    assert (
-        min(iou) > 0.88 and np.mean(iou) > 0.94
-    )  # before the wall only the hull of the higher views shows the outline
+    assert min(iou) > 0.905 and np.mean(iou) > 0.955  # before the wall only the hull of higher views shows the outline
 
 
 def test_a_contact_shadow_in_all_masks_becomes_texture_of_the_plane():
@@ -78,7 +76,7 @@ def test_a_contact_shadow_in_all_masks_becomes_texture_of_the_plane():
     masks = {v.photo.name: (mask | shadow).astype(np.uint8) * 255 for v, mask, shadow in pairs}
     result = fused_masks(found, scene, masks)
     left = [((result[v.photo.name] > 127) & shadow).sum() / shadow.sum() for v, _, shadow in pairs]
-    assert np.mean(left) < 0.5  # the part next to the ball, which few views show; 0.7 if the masks limit the texture
+    assert np.mean(left) < 0.1  # a pixel along the ball; 0.36 with COVERED 0.5, 0.7 if masks limit the texture
 
 
 def test_masks_of_a_pixel_leave_no_colors_and_are_accepted():
