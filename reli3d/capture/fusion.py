@@ -18,7 +18,7 @@ from reli3d.capture.mapping import Map, View
 from reli3d.capture.masks import COARSE_SIDE, full_size, grabcut, reduced, refined
 from reli3d.capture.scene import Scene
 
-SIDES = COARSE_SIDE, COARSE_SIDE, 720  # pixels along the longer side of the images, in each pass: memory limits the last
+SIDES = COARSE_SIDE, COARSE_SIDE, 720  # pixels along the longer side of the images; memory limits the last
 TEXEL = 1.5  # pixels of the images, at the cameras' median distance
 ROWS, GAIN_STEP = 64, 4  # texels: rows at a time; gains are compared at every fourth in both directions
 TEXTURE_REACH = 0.9  # of the cameras' median distance: half the side of the textured square
