@@ -28,7 +28,8 @@ from reli3d.pipeline import Network, NoSurface, encode, extract, prepare
 from reli3d.train.batches import stored_views
 from reli3d.views.similarity import Similarity
 
-OFFSETS = (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0)  # candidates; the last gives about the visual hull
+# candidates; the last gives about the visual hull
+OFFSETS = (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0)
 FEW_VIEWS, MANY_VIEWS = 1, CALIBRATED_VIEWS  # numbers of views that are tried
 COMPARED_SIZE = 96  # pixels of the normal maps that are compared
 MIN_ERROR, MAX_ERROR = 1e-3, math.log(20.0)  # of a normal map: 2 degrees everywhere; a mesh of 20 times the area
