@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 SMALL_STAGES = ("pixels", "small")
 LIGHT_PRIOR = "light_prior"
 SIDES = 64, 128, 256  # of the images of stage pixels
-CALIBRATED = 5  # least views of a sample for calibration: four are input, one is compared
 OF_LOOP = ("steps", "minutes", "batch", "rate", "seed", "save_every", "tensorboard")
 OF_NETWORK = ("weights", "validation", "export", "license", "max_views", "bfloat16", "device")
 OF_SMALL = (*OF_NETWORK, "points", "pyramid_rate", "maps", "material_bins")
@@ -132,12 +131,14 @@ def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 def small_stage(args: argparse.Namespace) -> Stage:
     """A stage of the small network."""
+    from reli3d.nn.presets import CALIBRATED_VIEWS
     from reli3d.nn.value_bins import with_bins
     from reli3d.synthetic.stored import check_samples
     from reli3d.train.pixels import reduced_model
     from reli3d.train.small import PixelStage, SmallStage
 
     pixels = args.stage == "pixels"
+    calibrated = CALIBRATED_VIEWS + 1  # views of a sample for calibration: one is compared
     if pixels and "export" in args:
         raise InputError("--export", "expected stage small, got pixels; train --stage small from it first")
     exporting = "export" in args
@@ -145,9 +146,9 @@ def small_stage(args: argparse.Namespace) -> Stage:
         raise InputError("data", "expected folders of samples, got none; make them with reli3d-data")
     if not (exporting and "validation" in args):
         for folder in args.data:
-            check_samples(folder, "data", views=CALIBRATED if exporting else 1, points=not pixels)
+            check_samples(folder, "data", views=calibrated if exporting else 1, points=not pixels)
     if "validation" in args:
-        check_samples(args.validation, "validation", views=CALIBRATED)
+        check_samples(args.validation, "validation", views=calibrated)
     side = getattr(args, "image_size", SIDES[0])
     if pixels and side not in SIDES:
         raise InputError("--image-size", f"expected {', '.join(map(str, SIDES))} for stage pixels, got {side}")
@@ -157,8 +158,8 @@ def small_stage(args: argparse.Namespace) -> Stage:
     finest = SIDES[::-1].index(side) if pixels else 0
     model = reduced_model(model, finest).train() if finest else model
     names = ("seed", "max_views", "points", "pyramid_rate", "bfloat16", "maps", "validation")
-    device = device_of(args)
-    return (PixelStage if pixels else SmallStage)(model, args.data, device=device, **given(args, *names))
+    make = PixelStage if pixels else SmallStage
+    return make(model.to(device_of(args)), args.data, **given(args, *names))
 
 
 def device_of(args: argparse.Namespace) -> str:
@@ -277,7 +278,7 @@ def export(args: argparse.Namespace, stage: Stage) -> LocalReconstructor | Recon
     from reli3d.train import checkpoint
     from reli3d.train.calibrate import calibrate
 
-    model: Any = stage.model
+    model: Any = stage.model.cpu()
     path = args.output / "state.pt"
     state = checkpoint.load(path)
     checkpoint.check_shapes(path, state["average"], model)

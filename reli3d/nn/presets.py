@@ -192,8 +192,7 @@ class LocalPreset(_Checked):
     radius: float = 0.87  # half side of the model's cube
     softness: float = 0.02  # unit of the signed distance: occupancy is sigmoid(-distance / softness)
     offset_one_view: float = 0.0  # outward offset of the surface, in units of softness; see reli3d.train.calibrate
-    # with V views: linear in 1 / min(V, CALIBRATED_VIEWS) between the offset of one view and this limit of 1 / V = 0
-    offset_many_views: float = 0.0
+    offset_many_views: float = 0.0  # the same for 1 / V = 0; with V views linear in 1 / min(V, CALIBRATED_VIEWS)
     smoothing: int = 8  # iterations of Taubin smoothing of the extracted surface
 
     def __post_init__(self):

@@ -51,16 +51,14 @@ class SmallStage(Stage):
         bfloat16: bool = False,
         maps: Path | None = None,
         validation: Path | None = None,
-        device: torch.device | str = "cpu",
     ):
         """folders: of ``*.safetensors`` from ``reli3d-data``.  max_views: upper limit of the random number of input
         views.  points: volume points per object; half as many surface points.  pyramid_rate: multiplier of the
         learning rate of the 2D U-Net, which small batches degrade at the full rate.  bfloat16: compute dtype of the
         convolutions.  maps: environment maps, .npz, for relighting samples.  validation: folder of held-out samples.
-        device: of the model and the samples.
+        Samples are loaded to the device of ``model``.
         """
-        self.model, self.folders, self.seed = model.to(device), tuple(folders), seed
-        self.device = torch.device(device)
+        self.model, self.folders, self.seed = model, tuple(folders), seed
         self.max_views, self.points, self.pyramid_rate = max_views, points, pyramid_rate
         self.lights = training_maps(maps) if maps else None
         self.held_out = sorted(validation.glob("*.safetensors"))[:VALIDATION_OBJECTS] if validation else []
@@ -87,7 +85,7 @@ class SmallStage(Stage):
     def batch(self, step: int, objects: range) -> Sequence[Any]:
         seeds = [(self.seed, step, k) for k in objects]
         numbers = {"points": self.points, "max_views": self.max_views}
-        return draw_samples(self.files(step), seeds, lights=self.lights, device=self.device, **numbers)
+        return draw_samples(self.files(step), seeds, lights=self.lights, device=self.model.device, **numbers)
 
     def losses(self, item: Any) -> dict[str, Tensor]:  # a Sample
         return losses(self.model, item)
@@ -130,7 +128,7 @@ class PixelStage(SmallStage):
 
     def __init__(self, model: LocalReconstructor, folders: Sequence[Path], **options: Any):
         super().__init__(model, folders, **options)
-        self._cache = ViewCache(model.pyramid.finest, self.device)
+        self._cache = ViewCache(model.pyramid.finest, model.device)
 
     def batch(self, step: int, objects: range) -> Sequence[Any]:
         """A single item with all objects: convolutions of small images are faster in large batches."""

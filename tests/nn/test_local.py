@@ -113,8 +113,8 @@ def test_any_number_of_views_in_any_order(model, views):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3)
 
 
-@torch.no_grad()
 @pytest.mark.parametrize(("views", "offset"), [(1, 1.0), (2, 0.4), (4, 0.1), (9, 0.1)])
+@torch.no_grad()
 def test_the_surface_offset_falls_with_the_number_of_views_up_to_four(model, monkeypatch, views, offset):
     """Linear in 1 / V; beyond four views, the most that calibration measures, it does not fall further."""
     points, before = surface_of_ball()[0], encoded(model, *sphere(views)).free_sdf(surface_of_ball()[0])
@@ -123,6 +123,7 @@ def test_the_surface_offset_falls_with_the_number_of_views_up_to_four(model, mon
     torch.testing.assert_close(before - after, torch.full_like(before, offset), atol=1e-5, rtol=0)  # float32 rounding
 
 
+@torch.no_grad()
 def test_mirror_images_have_the_mirrored_maps(model):
     """The 2D U-Net does not read them; normals and points that they show are the photographs' ones, mirrored."""
     images, masks, c2w, intrinsics = sphere(3)

@@ -70,8 +70,7 @@ def test_the_other_half_comes_nearer_to_the_reference(views):
         asset = reconstruct(views, options=ReconstructOptions(texture_size=256, symmetry=symmetry), watch=watch)
         found[symmetry] = overlap(asset)
         assert bool(watch.notes) == (symmetry == "auto")
-    # 0.912 and 0.887: the error falls by a fifth
-    assert found["auto"] > 0.9 and 1.0 - found["auto"] < 0.85 * (1.0 - found["off"])
+    assert found["auto"] > found["off"] + 0.05
 
 
 def test_mirror_images_determine_shape_and_base_color_but_not_the_lighting(views):
