@@ -404,17 +404,13 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
     """Refines mesh, maps and lighting of ``asset`` by inverse rendering of ``views``.
 
-    To judge the fit, views are held out: one if there are 3 to 11, two if 12 or more.  On the fitted
-    surface, material (base color, roughness, metallic, shading normals) and lighting are each blended between their
-    initial (weight 0) and fitted (weight 1) values, with weight 1, 1/2 or 0.  Weights are tried in a fixed order, from
-    the complete fit to the fitted surface alone.  The result is the first blend whose mean PSNR over the fitted, the
-    held-out and all views is not lower than the initial PSNR, within a small tolerance; if there is none, the result is
-    ``asset``.
+    The colors of some views are held out (:func:`reli3d.fit.refine.held_out`).  Material and lighting are each blended
+    between start and fit with the first weights for which the mean PSNR over fitted, held-out and all views is not
+    lower than the start's, within a small tolerance; if there are none, the result is ``asset``.
 
-    views: any number, in the frame of ``asset``, which is the cameras' frame unless ``ReconstructOptions.up`` changed
-    it.  seconds, steps: duration of the optimization, exactly one of the two; with ``steps`` the result is
-    reproducible.  options: see :func:`reli3d.fit.refine.refine`.  Returns a new asset without gradients.  Raises
-    TypeError for a wrong type, ValueError unless exactly one of ``seconds`` and ``steps`` is given.
+    views: in the frame of ``asset``.  seconds, steps: the budget, exactly one; with ``steps`` the result is
+    reproducible.  options: see :func:`reli3d.fit.refine.refine`.  Returns a new asset without gradients.
+    Raises TypeError for a wrong type, ValueError unless exactly one of ``seconds`` and ``steps`` is given.
 
     >>> views = reli3d.load_views("photos/shoe", every=True)
     >>> asset = reli3d.refine(reli3d.reconstruct(views.taken()), views, seconds=60)

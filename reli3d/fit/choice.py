@@ -170,14 +170,14 @@ def mean_psnr(errors: Tensor) -> float:
 def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> tuple[Asset, Parts, Tensor]:
     """Selects the first of ``CANDIDATES`` that is no worse than the start; returns asset, weights, errors ``(V,)``.
 
-    A candidate is accepted if its mean PSNR is at most ``PSNR_TOLERANCE_DB`` below the start's on the ``used`` views,
-    on the ``held`` views and on all views; the limits are ``SURFACE_TOLERANCES_DB`` if only the surface changes.  With
-    fewer than ``MIN_VIEWS_FULL_WEIGHT`` used views, the material weight is at most 1/2, and so is the lighting weight
-    if a view is held out.  If no candidate is accepted, the start is returned.
+    used, held: indices of views.  before: errors ``(V,)`` of the start.  A candidate is accepted if its mean PSNR is at
+    most ``PSNR_TOLERANCE_DB`` (``SURFACE_TOLERANCES_DB`` if only the surface changes) below the start's on the ``used``
+    views, on the ``held`` views and on all views; if none is, the start is returned.  ``MIN_VIEWS_FULL_WEIGHT`` limits
+    the weights.
 
-    used, held: indices of views.  before: errors ``(V,)`` of the start.  Each candidate's light scale is fitted to the
-    used views, because the fit underestimates the lighting: the loss uses the tangent of the display curve, which rises
-    faster than the curve, and a blend of log radiance is darker than a blend of radiance.
+    Each candidate's light scale is fitted to the used views, because the fit underestimates the lighting: the loss uses
+    the tangent of the display curve, which rises faster than the curve, and a blend of log radiance is darker than a
+    blend of radiance.
     """
     renderer = ViewRenderer(fitted.surface, fitted.received, fitted.images)
     moved = float(fitted.surface is not fitted.first)

@@ -64,8 +64,9 @@ class InputImages:
     def of(cls, views: PosedImages, light: str | Sequence[Hashable] = "object") -> InputImages:
         """Converts sRGB images to linear.
 
-        light: ``object``, lighting fixed to the object; ``camera``, lighting fixed to the camera; or a lighting name
-        per view.  Raises TypeError or ValueError if shapes or devices do not match, or for an invalid ``light``.
+        light: ``object``, lighting fixed to the object; ``camera``, lighting fixed to the camera, as on a turntable or
+        with a flash; or a label per view: views with equal labels share their lighting.  Raises TypeError or ValueError
+        if shapes or devices do not match, or for an invalid ``light``.
         """
         images, masks = views.images, views.masks
         check("images", images, last=3)

@@ -96,21 +96,15 @@ def refine(
 ) -> Refinement:
     """Fits surface, material and lighting of ``asset`` to posed images by inverse rendering.
 
-    views: images, masks and cameras in the frame of ``asset``.  seconds, steps: the budget, exactly one of the two;
-    with ``steps`` the result is deterministic on one CPU, not on CUDA.  resolution: grid cells along the longest side,
-    raised automatically for thin objects (:func:`~reli3d.fit.shape.start_grid`).  weights: loss weights; None: the
-    defaults.  cameras: optimize the camera poses as well.  light: ``object``: the lighting is fixed to the object;
-    ``camera``: it is fixed to the camera, as on a turntable or with a flash; a sequence of labels, one per view: views
-    with equal labels share their lighting.  Unless ``object``, the result has the lighting of view 0.  seed: random
-    seed.  bar: show progress on stderr.  interrupt: called before every step; once it returns True the fit ends with
-    the best result so far.
+    views: images, masks and cameras in the frame of ``asset``.  seconds, steps: the budget, exactly one;
+    with ``steps`` the result is deterministic on one CPU.  resolution: of :func:`~reli3d.fit.shape.start_grid`.
+    cameras: optimize the poses as well.  light: of :meth:`InputImages.of`; unless ``object``, the result has the
+    lighting of view 0.  bar: show progress on stderr.  interrupt: called before every step; True ends the fit with the
+    best result so far.
 
-    With three or more views, some are held out (:func:`held_out`).  Of these the fit uses the masks but not the
-    colors.  After the fit, the errors of the fitted and of the held-out views decide whether the fitted surface is kept
-    and whether the fitted material and lighting are kept fully, by half or not at all
-    (:func:`~reli3d.fit.choice.chosen`).  The inputs are detached: no gradient reaches them, and the result has none.
-    Raises TypeError or ValueError if asset and views have different devices, if shapes do not match, for an invalid
-    ``light``, for a budget that is not one positive number, or if the asset lacks an environment, an atlas or faces.
+    The colors of :func:`held_out` views are not fitted.  :func:`~reli3d.fit.choice.chosen` selects what is kept.
+    Nothing has gradients.  Raises TypeError or ValueError for mismatched shapes or devices, an invalid ``light`` or
+    budget, or an asset without environment, atlas or faces.
     """
     images, weights = InputImages.of(views, light), weights or losses.Weights()
     _check_asset(asset, images)
