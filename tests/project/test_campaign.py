@@ -30,63 +30,87 @@ def small_threads(threads):
     threads(1)  # a fork does not inherit torch's threads
 
 
-def outcomes(read, count: int = 3):
-    target = Target("planted", {"a.txt": b"one"}, read)
-    return list(campaign.in_fork([(k, target, []) for k in range(count)]))
+def fault_of(read, before=lambda folder: None) -> str:
+    """Of the second of two inputs, of which the first is read by ``before``."""
+    inputs = [(Target("planted", {"a.txt": b"one"}, r), 0, {"a.txt": b"one"}) for r in (before, read)]
+    return [o.fault for o in campaign.outcomes(inputs)][1]
 
 
-def test_every_kind_of_fault_is_distinguished_and_none_leaves_files(small_threads, monkeypatch, tmp_path):
+def raises(error):
+    def read(folder):
+        raise error
+
+    return read
+
+
+def busy(seconds: float):
+    def read(folder):
+        began = time.process_time()
+        while time.process_time() < began + seconds:
+            pass
+
+    return read
+
+
+ALLOWED = [
+    lambda folder: (folder / "a.txt").read_bytes(),
+    raises(ValueError("a: expected b")),
+    raises(OSError(2, "none")),
+]
+PLANTED = [
+    *(
+        ("wrong", raises(e))
+        for e in (KeyError("x"), RuntimeError(), MemoryError(), SystemExit(3), ValueError("two\nlines"))
+    ),
+    ("wrong", raises(ValueError())),
+    ("slow", busy(0.5)),
+    (("crash", "slow"), busy(60.0)),  # ended by the limit on the processor's time, or of the wait on a busy machine
+    ("slow", lambda folder: time.sleep(60)),
+    ("crash", lambda folder: os.kill(os.getpid(), signal.SIGSEGV)),
+]
+
+
+def test_planted_faults_are_found_and_leave_no_files(small_threads, monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(campaign, "SECONDS", 0.2)
-    monkeypatch.setattr(campaign, "MEMORY", 1 << 26)
     monkeypatch.setattr(campaign, "WALL", 3.0)
-
-    def raises(error):
-        def read(folder):
-            raise error
-
-        return read
-
-    def busy(seconds):
-        def read(folder):
-            began = time.process_time()
-            while time.process_time() < began + seconds:
-                pass
-
-        return read
+    for read in ALLOWED:
+        assert fault_of(read, PLANTED[-1][1]) == ""  # after a crash the rest goes to another process
+    for kind, read in PLANTED:
+        assert fault_of(read).startswith(kind), (kind, read)
+    monkeypatch.setattr(campaign, "SECONDS", 5.0)  # writing 128 MiB may take longer than the limits above
+    monkeypatch.setattr(campaign, "WALL", 60.0)
+    monkeypatch.setattr(campaign, "MEMORY", 1 << 26)
 
     def kept(folder):
         return bytearray(b"x") * (1 << 27)
 
-    assert [o.kind for o in outcomes(lambda folder: (folder / "a.txt").read_bytes())] == ["accepted"] * 3
-    assert [o.kind for o in outcomes(raises(ValueError("a: expected b")))] == ["refused"] * 3
-    assert [o.kind for o in outcomes(raises(OSError(2, "none")))] == ["refused"] * 3
-    for error in (KeyError("x"), RuntimeError(), MemoryError(), SystemExit(3), ValueError("two\nlines"), ValueError()):
-        assert [o.kind for o in outcomes(raises(error))] == ["wrong"] * 3, error
-    assert [o.kind for o in outcomes(busy(0.5), 1)] == ["slow"]
-    assert [o.kind for o in outcomes(busy(60.0), 1)] == ["slow"]  # ended by the limit on the processor's time
-    assert [o.kind for o in outcomes(lambda folder: time.sleep(60), 1)] == ["slow"]
-    monkeypatch.setattr(campaign, "SECONDS", 5.0)  # writing 128 MiB may take longer than the limits above
-    monkeypatch.setattr(campaign, "WALL", 60.0)
-    assert [o.kind for o in outcomes(kept, 1)] == ["memory"]
-    free = [bytearray(b"x") * (1 << 16) for _ in range(1 << 12)]  # 256 MiB in pieces, which the heap keeps when freed
-    del free[:-1]
-    assert [o.kind for o in outcomes(kept, 1)] == ["memory"]
-    (crash,) = outcomes(lambda folder: os.kill(os.getpid(), signal.SIGSEGV))  # the rest goes to another process
-    assert (crash.kind, crash.text) == ("crash", "SIGSEGV")
-    assert list(tmp_path.iterdir()) == []
+    def freed(folder):  # 256 MiB in pieces, which the heap keeps
+        del [bytearray(b"x") * (1 << 16) for _ in range(1 << 12)][:-1]
+
+    assert fault_of(kept).startswith("memory") and fault_of(kept, freed).startswith("memory")
+    assert not list(tmp_path.iterdir())
 
 
 def test_good_files_are_accepted(tmp_path, small_threads):
-    found = [target for target in targets(tmp_path) if not target.known]
-    assert [o.kind for o in campaign.in_fork([(k, t, []) for k, t in enumerate(found)])] == ["accepted"] * len(found)
+    def accepted(read):
+        def only(folder):
+            try:
+                read(folder)
+            except (ValueError, OSError) as error:
+                raise AssertionError(error) from error
+
+        return only
+
+    found = [dataclasses.replace(t, read=accepted(t.read)) for t in targets(tmp_path) if not t.known]
+    assert [o.fault for o in campaign.outcomes([(t, 0, t.files) for t in found])] == [""] * len(found)
 
 
 @pytest.mark.parametrize("count", [140, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_hostile_inputs_are_read_or_refused_in_one_line(tmp_path, small_threads, count):
-    found = campaign.Campaign(20, targets(tmp_path / "good"), tmp_path / "findings")
-    assert found.run(count, time.monotonic() + 3600) == count
-    assert found.failed == [], found.report()
+    found = targets(tmp_path)
+    ended = list(campaign.outcomes([campaign.drawn(found, 20, number) for number in range(count)]))
+    assert len(ended) == count and [(o.name, o.fault) for o in ended if o.fault] == []
 
 
 def test_an_input_read_as_another_fails(tmp_path, small_threads, monkeypatch):
