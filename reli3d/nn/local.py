@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -66,6 +66,10 @@ class PixelMaps:
     bins: Tensor  # (V, P, P, 2, B) log probability of roughness and metallic k / (B - 1); with B = 1 nothing
     normal: Tensor  # (V, P, P, 3) world, unit
     depth: Tensor  # (V, P, P, 1) along the camera axis, relative to the world origin's
+
+    def of_views(self, count: int) -> PixelMaps:
+        """The maps of the first ``count`` views."""
+        return PixelMaps(**{f.name: getattr(self, f.name)[:count] for f in fields(self)})
 
     @staticmethod
     def of(raw: Tensor, span: Tensor, camera: Camera, mean: Tensor) -> PixelMaps:

@@ -12,14 +12,19 @@ from safetensors import safe_open
 from torch import Tensor
 from torch.nn import functional
 
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import mask_distance
+from reli3d.geometry.symmetry import MirrorPlane
 from reli3d.render.latlong import lat_long_directions, quarter_turn
+from reli3d.train.mirror import mirrored_visibility, surface_mirror
 from reli3d.train.relight import Finish, draw_light, relight_views
 from reli3d.views.views import Views
 
 OTHER_UP_PROBABILITY = 0.12  # of a world that is not +Y up: captures come in any frame
 MAX_NOISE = 0.012  # largest standard deviation of the image noise, sRGB
 RELIGHT_PROBABILITY = 0.5  # of views that are rendered again under another environment
+MIRROR_PROBABILITY = 0.4  # of mirror images of the views of a symmetric object, as at inference
+MAX_MIRRORED = 4  # views with mirror images
 UNCHANGED_PROBABILITY = 0.75  # of not mirroring, and of not permuting the color channels
 
 
@@ -72,9 +77,11 @@ class Sample(TrainingViews):
     distance: Tensor  # (M,)
     surface: Tensor  # (N, 3, 3) position, normal, bump-mapped normal
     material: Tensor  # (N, 5)
-    visible: Tensor  # (N, V)
+    visible: Tensor  # (N, V + M), in mirror images only what no view shows
     light_directions: Tensor  # (2048, 3)
     light: Tensor  # (2048, 3) linear radiance
+    mirrored_c2w: Tensor  # (M, 4, 4), M = V cameras of the mirror images of a symmetric object, or 0
+    mirrored_intrinsics: Tensor  # (M, 4)
 
 
 def load_sample(
@@ -112,6 +119,15 @@ def load_sample(
         s = run("surface", points // 2, 0, file.get_slice("material").get_shape()[0], rng)
         surface, material = file.get_slice("surface")[s].float(), file.get_slice("material")[s].float() / 255
         visible = file.get_slice("visible")[s][:, chosen].float()
+        plane = None
+        if augment and len(chosen) <= MAX_MIRRORED and rng.spawn(1)[0].random() < MIRROR_PROBABILITY:
+            every = file.get_slice("surface")[:, 0].cpu().numpy().astype(np.float64)
+            plane = surface_mirror(every)
+        if plane is not None:
+            seen = file.get_slice("visible")[:][:, chosen].cpu().numpy()
+            shown = mirrored_visibility(every, seen, surface[:, 0].cpu().numpy().astype(np.float64), plane)
+            unseen = 1.0 - visible.amax(1, keepdim=True)
+            visible = torch.cat([visible, torch.as_tensor(shown).to(visible) * unseen], 1)
         images, c2w, intrinsics = of_views("images").float() / 255, of_views("c2w"), of_views("intrinsics")
         known = finish_known(file)[chosen]
         of_pixels = of_views("view_material").float() / 255
@@ -151,6 +167,10 @@ def load_sample(
         pooled = functional.avg_pool2d((values * valid[..., None]).permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1)
         return pooled / fraction
 
+    mirrors = Camera(c2w[:0], intrinsics[:0], *masks.shape[:0:-1])
+    if plane is not None:
+        normal = turn @ torch.as_tensor(plane[0], dtype=torch.float32, device=device)
+        mirrors = MirrorPlane(normal, plane[1]).mirrored(Camera(c2w, intrinsics, *masks.shape[:0:-1]))
     origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # depth of the world's origin
     return Sample(
         images=color.contiguous(),
@@ -170,6 +190,8 @@ def load_sample(
         visible=visible,
         light_directions=lat_long_directions(light.shape[0], device=device).reshape(-1, 3) @ turn.T,
         light=light.reshape(-1, 3),
+        mirrored_c2w=mirrors.c2w,
+        mirrored_intrinsics=mirrors.intrinsics,
     )
 
 

@@ -43,13 +43,13 @@ PIXEL_TERMS = tuple(name for name in WEIGHTS if name.startswith("pixel"))
 
 
 def encode_sample(model: LocalReconstructor, sample: Sample) -> LocalField:
-    return model.encode(*_views_of(sample))
-
-
-def _views_of(sample: Sample) -> tuple[Tensor, ...]:
-    """Arguments of :meth:`~reli3d.nn.local.LocalReconstructor.encode`."""
-    detail = torch.cat([sample.images, sample.silhouette[..., None]], -1).contiguous()
-    return sample.images, sample.masks, sample.c2w, sample.intrinsics, detail, sample.intrinsics
+    """The sample's views and mirror images, encoded."""
+    mirrored = len(sample.mirrored_c2w)
+    detail = torch.cat([sample.images, sample.silhouette[..., None]], -1)
+    images, masks, detail = (torch.cat([t, t[:mirrored].flip(2)]) for t in (sample.images, sample.masks, detail))
+    c2w = torch.cat([sample.c2w, sample.mirrored_c2w])
+    intrinsics = torch.cat([sample.intrinsics, sample.mirrored_intrinsics])
+    return model.encode(images, masks, c2w, intrinsics, detail, intrinsics, mirrored=mirrored)
 
 
 def pixel_losses(model: LocalReconstructor, group: Group) -> dict[str, Tensor]:
@@ -60,14 +60,14 @@ def pixel_losses(model: LocalReconstructor, group: Group) -> dict[str, Tensor]:
 
 def losses(model: LocalReconstructor, sample: Sample) -> dict[str, Tensor]:
     """Unweighted terms, each a scalar; gradients reach every parameter."""
-    field = encode_sample(model, sample)
+    field, count = encode_sample(model, sample), len(sample.images)
     position, normal, bumped = (t.contiguous() for t in sample.surface.unbind(1))
     normal, bumped = functional.normalize(normal, dim=-1), functional.normalize(bumped, dim=-1)
     field = field.with_shading(position, normal, sample.visible)
     return {
         **_shape_terms(field, sample, position, normal),
         **_material_terms(field, sample, position, normal, bumped),
-        **_pixel_terms(field.pixels, field.color, sample, (len(sample.images),)),
+        **_pixel_terms(field.pixels.of_views(count), field.color[:count], sample, (count,)),
         **_light_terms(field, sample),
     }
 

@@ -22,7 +22,8 @@ LAMP_PROBABILITY = 0.6  # of lamps added to an environment
 SATURATES = 4.0  # a pixel's radiance, as in reli3d.synthetic.samples
 TINT_SIGMA = 0.1  # standard deviation of the logarithm of the color of the lighting
 EXPOSURE = 0.35  # standard deviation of the logarithm of the exposure
-METAL_PROBABILITY, NONMETAL_PROBABILITY = 0.08, 0.05  # of metallic set to 1, and to 0, everywhere
+METAL_PROBABILITY, NONMETAL_PROBABILITY = 0.08, 0.25  # of metallic set to 1, and to 0, everywhere
+GLOSSY_PROBABILITY, GLOSSY_GAIN = 0.4, 0.45  # of nonmetals whose roughness is multiplied: glazes, varnish, plastic
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,9 @@ class Finish:
             return Finish(1.0, 1.0, 0.0, None)
         kind = rng.random()
         metallic = 1.0 if kind < METAL_PROBABILITY else 0.0 if kind < METAL_PROBABILITY + NONMETAL_PROBABILITY else None
-        return Finish(
-            float(np.exp(rng.normal(0, 0.35))), float(np.exp(rng.normal(0, 0.25))), float(rng.normal(0, 0.08)), metallic
-        )
+        gloss = GLOSSY_GAIN if metallic == 0.0 and rng.random() < GLOSSY_PROBABILITY else 1.0
+        gamma, gain = (float(np.exp(rng.normal(0, sigma))) for sigma in (0.35, 0.25))
+        return Finish(gamma, gloss * gain, float(rng.normal(0, 0.08)), metallic)
 
     def apply(self, material: Tensor) -> Tensor:
         """Changed ``material (..., 5)``: base color (sRGB), roughness, metallic."""
