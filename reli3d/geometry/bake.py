@@ -131,52 +131,49 @@ def coverage(mesh: Mesh, size: int) -> Tensor:
 
 
 def interpolate(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions and unit normals ``(N, 3)`` at the valid texels with flat int64 indices ``index (N,)``."""
-    return _positions_normals(mesh, _checked_places(mesh, texels, index), index)
+    """Positions and unit normals ``(N, 3)`` at the valid texels with flat int64 indices ``index (N,)``.
+
+    Where the normals of a face cancel, the normal of its vertex 0.
+    """
+    return _positions_normals(mesh, *_checked_corners(mesh, texels, index))
 
 
 def interpolate_tangents(mesh: Mesh, texels: Texels, index: Tensor) -> Tensor:
-    """Unit tangents with sign, ``(N, 4)``, at the valid texels with flat int64 indices ``index (N,)``."""
-    return _tangents(mesh, _checked_places(mesh, texels, index), index)
+    """Unit tangents with the sign of vertex 0, ``(N, 4)``; arguments as in :func:`interpolate`."""
+    return _tangents(mesh, *_checked_corners(mesh, texels, index))
 
 
-def _checked_places(mesh: Mesh, texels: Texels, index: Tensor) -> kernels.Places:
+def _checked_corners(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
     check("index", index, dtype=torch.int64, like=texels.bary)
     if index.ndim != 1 or (len(index) and not bool((texels.face.reshape(-1)[index] >= 0).all())):
         raise ValueError("index: expected a list of valid texels, got others")
-    return _places(mesh, texels, index)
+    return _corner_weights(mesh, texels, index)
 
 
-def _places(mesh: Mesh, texels: Texels, index: Tensor) -> kernels.Places:
-    """Kernel struct of the texels of ``index``."""
-    face, bary = texels.face.reshape(-1), texels.bary.reshape(-1, 2)
-    return struct_of(kernels.Places, texel=index, face=face, bary=bary, faces=mesh.faces.contiguous())
+def _corner_weights(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
+    """Vertices ``(N, 3)`` of the faces at the texels of ``index``, and their weights ``(N, 3, 1)``."""
+    bary = texels.bary.reshape(-1, 2)[index]
+    weight = torch.cat([1.0 - bary.sum(1, keepdim=True), bary], 1)
+    return mesh.faces[texels.face.reshape(-1)[index].long()].long(), weight[..., None]
 
 
-def _positions_normals(mesh: Mesh, places: kernels.Places, index: Tensor) -> tuple[Tensor, Tensor]:
+def _unit(values: Tensor, corner: Tensor, weight: Tensor) -> Tensor:
+    """Interpolated unit vectors ``(N, 3)``; those of vertex 0 where they cancel."""
+    mean = (values[corner] * weight).sum(1)
+    none = mean.square().sum(1, keepdim=True) < 1e-12
+    return torch.nn.functional.normalize(torch.where(none, values[corner[:, 0]], mean), dim=1)
+
+
+def _positions_normals(mesh: Mesh, corner: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
-    position, normal = (torch.empty(len(index), 3, device=index.device, dtype=torch.float32) for _ in range(2))
-    sources = [v.detach().contiguous() for v in (mesh.vertices, normals)]
-    _bridge.launch(kernels.attributes_kernel, len(index), [places, *sources, position, normal], index.device)
-    return position, normal
+    return (mesh.vertices.detach()[corner] * weight).sum(1), _unit(normals.detach(), corner, weight)
 
 
-def _tangents(mesh: Mesh, places: kernels.Places, index: Tensor) -> Tensor:
+def _tangents(mesh: Mesh, corner: Tensor, weight: Tensor) -> Tensor:
     if mesh.tangents is None:
         raise ValueError("mesh.tangents: expected tangents, got None (see Mesh.with_tangents)")
-    tangent = torch.empty(len(index), 4, device=index.device, dtype=torch.float32)
-    inputs = [places, mesh.tangents.detach().contiguous(), tangent]
-    _bridge.launch(kernels.tangents_kernel, len(index), inputs, index.device)
-    return tangent
-
-
-def _values(mesh: Mesh, values: Tensor, places: kernels.Places, index: Tensor) -> Tensor:
-    check("values", values, like=mesh.vertices)
-    if values.ndim != 2 or len(values) != len(mesh.vertices):
-        raise ValueError(f"values: expected ({len(mesh.vertices)}, C), got {tuple(values.shape)}")
-    out = torch.empty(len(index), values.shape[1], device=index.device, dtype=torch.float32)
-    _bridge.launch(kernels.values_kernel, len(index), [places, values.detach().contiguous(), out], index.device)
-    return out
+    tangents = mesh.tangents.detach()
+    return torch.cat([_unit(tangents[:, :3], corner, weight), tangents[corner[:, 0], 3:]], 1)
 
 
 def bake(
@@ -212,18 +209,22 @@ def bake(
         texels = rasterize_texels(mesh, size)
     elif texels.face.shape != (size, size):
         raise ValueError(f"texels: expected size {size}, got {tuple(texels.face.shape)}")
+    if values is not None:
+        check("values", values, like=mesh.vertices)
+        if values.ndim != 2 or len(values) != len(mesh.vertices):
+            raise ValueError(f"values: expected ({len(mesh.vertices)}, C), got {tuple(values.shape)}")
     index = torch.nonzero(texels.valid.reshape(-1)).reshape(-1)
     if len(index) == 0:
         raise ValueError("mesh.uv: expected a surface within [0, 1]^2, got one that covers no texel")
     maps: dict[str, Tensor] = {}
     with torch.no_grad():
         for part in index.split(chunk):
-            places = _places(mesh, texels, part)
-            arguments: tuple[Tensor, ...] = _positions_normals(mesh, places, part)
+            corner, weight = _corner_weights(mesh, texels, part)
+            arguments: tuple[Tensor, ...] = _positions_normals(mesh, corner, weight)
             if tangents:
-                arguments = (*arguments, _tangents(mesh, places, part))
+                arguments = (*arguments, _tangents(mesh, corner, weight))
             if values is not None:
-                arguments = (*arguments, _values(mesh, values, places, part))
+                arguments = (*arguments, (values.detach()[corner] * weight).sum(1))
             found = fn(*arguments)
             found = {"value": found} if isinstance(found, Tensor) else found
             if maps and found.keys() != maps.keys():

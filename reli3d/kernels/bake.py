@@ -26,16 +26,6 @@ class Tiles:
     tile: int  # and along a tile
 
 
-@wp.struct
-class Places:
-    """Flat indices of the texels to evaluate; face and weights of every texel of the map; vertices of the faces."""
-
-    texel: wp.array[wp.int64]
-    face: wp.array[wp.int32]
-    bary: wp.array[wp.vec2]
-    faces: wp.array2d[wp.int32]
-
-
 @wp.func
 def cross2(a: wp.vec2, b: wp.vec2) -> float:
     return a[0] * b[1] - a[1] * b[0]
@@ -52,6 +42,28 @@ def weight_on_segment(a: wp.vec2, b: wp.vec2, p: wp.vec2) -> float:
     """Weight in [0, 1] of ``b`` at the point of the segment nearest to ``p``."""
     e = b - a
     return wp.clamp(wp.dot(p - a, e) / wp.max(wp.dot(e, e), 1.0e-20), 0.0, 1.0)
+
+
+@wp.func
+def tile_box(tiles: Tiles, i: int) -> wp.vec4i:
+    """First column, first row, last column and last row of tile ``i``."""
+    across = (tiles.size + tiles.tile - 1) // tiles.tile
+    x = (i % across) * tiles.tile
+    y = (i // across) * tiles.tile
+    return wp.vec4i(x, y, wp.min(x + tiles.tile, tiles.size) - 1, wp.min(y + tiles.tile, tiles.size) - 1)
+
+
+@wp.func
+def centers(a: wp.vec2, b: wp.vec2, c: wp.vec2, box: wp.vec4i) -> wp.vec4i:
+    """The part of ``box`` whose texels have their centers in the bounding box of ``a``, ``a + b`` and ``a + c``."""
+    low = a + wp.min(wp.vec2(), wp.min(b, c)) - wp.vec2(0.5, 0.5)
+    high = a + wp.max(wp.vec2(), wp.max(b, c)) - wp.vec2(0.5, 0.5)
+    return wp.vec4i(
+        wp.max(int(wp.ceil(low[0])), box[0]),
+        wp.max(int(wp.ceil(low[1])), box[1]),
+        wp.min(int(wp.floor(high[0])), box[2]),
+        wp.min(int(wp.floor(high[1])), box[3]),
+    )
 
 
 @wp.kernel
@@ -74,15 +86,10 @@ def texels_kernel(
     ``segments`` holds 3 * face + corner of each edge on a border.  ``bary`` weighs vertices 1 and 2.
     """
     i = start + wp.tid()
-    tile = tiles.tile
-    across = (tiles.size + tile - 1) // tile
-    x0 = (i % across) * tile
-    y0 = (i // across) * tile
-    x1 = wp.min(x0 + tile, tiles.size) - 1
-    y1 = wp.min(y0 + tile, tiles.size) - 1
+    box = tile_box(tiles, i)
     far = reach * reach * 1.0001 + 1.0
-    for y in range(y0, y1 + 1):
-        for x in range(x0, x1 + 1):
+    for y in range(box[1], box[3] + 1):
+        for x in range(box[0], box[2] + 1):
             face[y, x] = -1
             bary[y, x] = wp.vec2(0.0, 0.0)
             distance[y, x] = far
@@ -94,12 +101,9 @@ def texels_kernel(
         area = cross2(b, c)
         if area != 0.0:
             inverse = 1.0 / area
-            left = wp.max(int(wp.ceil(a[0] + wp.min(0.0, wp.min(b[0], c[0])) - 0.5)), x0)
-            right = wp.min(int(wp.floor(a[0] + wp.max(0.0, wp.max(b[0], c[0])) - 0.5)), x1)
-            high = wp.max(int(wp.ceil(a[1] + wp.min(0.0, wp.min(b[1], c[1])) - 0.5)), y0)
-            low = wp.min(int(wp.floor(a[1] + wp.max(0.0, wp.max(b[1], c[1])) - 0.5)), y1)
-            for y in range(high, low + 1):
-                for x in range(left, right + 1):
+            over = centers(a, b, c, box)
+            for y in range(over[1], over[3] + 1):
+                for x in range(over[0], over[2] + 1):
                     if distance[y, x] > 0.0:
                         p = wp.vec2(float(x) + 0.5, float(y) + 0.5) - a
                         w1 = cross2(p, c) * inverse
@@ -117,10 +121,10 @@ def texels_kernel(
         k = code % 3
         a = tiles.corners[f, k]
         b = tiles.corners[f, (k + 1) % 3]
-        left = wp.max(int(wp.floor(wp.min(a[0], b[0]) - 0.5 - reach)), x0)
-        right = wp.min(int(wp.ceil(wp.max(a[0], b[0]) - 0.5 + reach)), x1)
-        high = wp.max(int(wp.floor(wp.min(a[1], b[1]) - 0.5 - reach)), y0)
-        low = wp.min(int(wp.ceil(wp.max(a[1], b[1]) - 0.5 + reach)), y1)
+        left = wp.max(int(wp.floor(wp.min(a[0], b[0]) - 0.5 - reach)), box[0])
+        right = wp.min(int(wp.ceil(wp.max(a[0], b[0]) - 0.5 + reach)), box[2])
+        high = wp.max(int(wp.floor(wp.min(a[1], b[1]) - 0.5 - reach)), box[1])
+        low = wp.min(int(wp.ceil(wp.max(a[1], b[1]) - 0.5 + reach)), box[3])
         for y in range(high, low + 1):
             for x in range(left, right + 1):
                 if distance[y, x] > 0.0:
@@ -153,14 +157,9 @@ def coverage_kernel(
 ):
     """Number of faces, 255 at most, whose interior holds each center of tile ``i``."""
     i = start + wp.tid()
-    tile = tiles.tile
-    across = (tiles.size + tile - 1) // tile
-    x0 = (i % across) * tile
-    y0 = (i // across) * tile
-    x1 = wp.min(x0 + tile, tiles.size) - 1
-    y1 = wp.min(y0 + tile, tiles.size) - 1
-    for y in range(y0, y1 + 1):
-        for x in range(x0, x1 + 1):
+    box = tile_box(tiles, i)
+    for y in range(box[1], box[3] + 1):
+        for x in range(box[0], box[2] + 1):
             hits[y, x] = wp.uint8(0)
     for s in range(tiles.face_start[i], tiles.face_start[i + 1]):
         f = tiles.face_list[s]
@@ -170,87 +169,15 @@ def coverage_kernel(
         turn = wp.float32(1.0)
         if cross2(b, c) < 0.0:
             turn = -1.0
-        left = wp.max(int(wp.ceil(a[0] + wp.min(0.0, wp.min(b[0], c[0])) - 0.5)), x0)
-        right = wp.min(int(wp.floor(a[0] + wp.max(0.0, wp.max(b[0], c[0])) - 0.5)), x1)
-        high = wp.max(int(wp.ceil(a[1] + wp.min(0.0, wp.min(b[1], c[1])) - 0.5)), y0)
-        low = wp.min(int(wp.floor(a[1] + wp.max(0.0, wp.max(b[1], c[1])) - 0.5)), y1)
-        for y in range(high, low + 1):
-            for x in range(left, right + 1):
+        over = centers(a, b, c, box)
+        for y in range(over[1], over[3] + 1):
+            for x in range(over[0], over[2] + 1):
                 p = wp.vec2(float(x) + 0.5, float(y) + 0.5) - a
                 w0 = turn * cross2(c - b, p - b) - cross2_error(c - b, p - b)
                 w1 = turn * cross2(p, c) - cross2_error(p, c)
                 w2 = turn * cross2(b, p) - cross2_error(b, p)
                 if wp.min(w0, wp.min(w1, w2)) > 0.0:
                     hits[y, x] = wp.uint8(wp.min(int(hits[y, x]) + 1, 255))
-
-
-@wp.kernel
-def attributes_kernel(
-    start: int,
-    # in
-    places: Places,
-    vertices: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    # out
-    position: wp.array[wp.vec3],
-    normal: wp.array[wp.vec3],
-):
-    """Interpolated position and unit normal at the listed texels; the normal of vertex 0 where they cancel."""
-    i = start + wp.tid()
-    t = places.texel[i]
-    f = places.face[t]
-    w = places.bary[t]
-    w0 = 1.0 - w[0] - w[1]
-    a = places.faces[f, 0]
-    b = places.faces[f, 1]
-    c = places.faces[f, 2]
-    position[i] = w0 * vertices[a] + w[0] * vertices[b] + w[1] * vertices[c]
-    n = w0 * normals[a] + w[0] * normals[b] + w[1] * normals[c]
-    if wp.length_sq(n) < 1.0e-12:
-        n = normals[a]
-    normal[i] = wp.normalize(n)
-
-
-@wp.kernel
-def tangents_kernel(
-    start: int,
-    # in
-    places: Places,
-    tangents: wp.array[wp.vec4],
-    # out
-    tangent: wp.array[wp.vec4],
-):
-    """Interpolated unit tangent at the listed texels with the sign w of vertex 0."""
-    i = start + wp.tid()
-    t = places.texel[i]
-    f = places.face[t]
-    w = places.bary[t]
-    a = tangents[places.faces[f, 0]]
-    m = (1.0 - w[0] - w[1]) * a + w[0] * tangents[places.faces[f, 1]] + w[1] * tangents[places.faces[f, 2]]
-    d = wp.vec3(m[0], m[1], m[2])
-    if wp.length_sq(d) < 1.0e-12:
-        d = wp.vec3(a[0], a[1], a[2])
-    d = wp.normalize(d)
-    tangent[i] = wp.vec4(d[0], d[1], d[2], a[3])
-
-
-@wp.kernel
-def values_kernel(
-    start: int,
-    # in
-    places: Places,
-    values: wp.array2d[float],
-    # out
-    value: wp.array2d[float],
-):
-    """Interpolated numbers of the vertices at the listed texels."""
-    i = start + wp.tid()
-    t = places.texel[i]
-    f = places.face[t]
-    w = places.bary[t]
-    for k in range(values.shape[1]):
-        first = (1.0 - w[0] - w[1]) * values[places.faces[f, 0], k]
-        value[i, k] = first + w[0] * values[places.faces[f, 1], k] + w[1] * values[places.faces[f, 2], k]
 
 
 @wp.kernel

@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from reli3d.geometry.camera import look_at
-from reli3d.synthetic import example, furniture, manmade, organic, vessels
+from reli3d.synthetic import furniture, manmade, organic, vessels
 from reli3d.synthetic.assembly import ON_BACK, ON_SIDE, Assembly
 from reli3d.synthetic.finishes import draw_materials
 from reli3d.synthetic.materials import Material, evaluate
@@ -82,27 +82,14 @@ def make_object(seed: int) -> ProceduralObject:
         attempt += 1
 
 
-def example_object() -> ProceduralObject:
-    """The example object of the package, see ``example.py``."""
-    assembly = Assembly(np.random.default_rng(0))
-    example.kettle(assembly)
-    return assemble(assembly, "kettle", example.finish())
-
-
-def assemble(assembly: Assembly, name: str, materials: tuple[Material, ...] | None = None) -> ProceduralObject:
-    """Builds the object of ``assembly``: union of at most MAX_FACES faces, normalization, normals, materials.
-
-    materials: of the parts; None draws them.
-    """
+def assemble(assembly: Assembly, name: str) -> ProceduralObject:
+    """Builds the object of ``assembly``: union of at most MAX_FACES faces, normalization, normals, random materials."""
     vertices, faces, part = assembly.finish(MAX_FACES)
     vertices = unit_size(vertices).astype(np.float32)
     used, part = np.unique(part, return_inverse=True)
     part = part.reshape(-1).astype(np.int32)
-    if materials is None:
-        roles = [assembly.roles[k] for k in used]
-        materials = draw_materials(assembly.rng, roles, part_bounds(vertices, faces, part))
-    else:
-        materials = tuple(materials[k] for k in used)
+    roles = [assembly.roles[k] for k in used]
+    materials = draw_materials(assembly.rng, roles, part_bounds(vertices, faces, part))
     return ProceduralObject(vertices, faces, corner_normals(vertices, faces), part, materials, name)
 
 

@@ -19,7 +19,6 @@ from reli3d.synthetic.procedural import (
     VALIDATION_SEEDS,
     assemble,
     corner_normals,
-    example_object,
     make_object,
     sample_cameras,
 )
@@ -29,7 +28,7 @@ SEEDS = range(500, 540)
 
 @pytest.fixture(scope="module")
 def objects():
-    return [make_object(seed) for seed in SEEDS] + [example_object()]
+    return [make_object(seed) for seed in SEEDS]
 
 
 def surface_points(shape, count, seed):

@@ -167,7 +167,7 @@ def test_every_view_of_a_drawn_object_is_read_once(folder):
 
 def test_levels_are_trained_one_after_the_other(folder, tmp_path):
     """From images of 64 pixels to the whole network by the command; each stage keeps the weights of the one before."""
-    start = ["--steps", "2", "--batch", "2", "--rate", "1e-9"]
+    start = ["--steps", "1", "--batch", "1", "--rate", "1e-9"]
     assert main([str(folder), str(tmp_path / "64"), "--stage", "pixels", "--image-size", "64", *start]) == 0
     from_64, from_128 = (["--weights", str(tmp_path / name / "state.pt")] for name in ("64", "128"))
     assert main([str(folder), str(tmp_path / "128"), "--stage", "pixels", "--image-size", "128", *from_64, *start]) == 0
