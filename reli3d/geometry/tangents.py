@@ -10,12 +10,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from reli3d._bridge import call, check, launch
+from reli3d._bridge import check
 from reli3d.geometry.topology import weld_rows
-from reli3d.kernels.bump import ENCODE_EPS, encode_normals_kernel
-from reli3d.kernels.tangents import corner_tangents_kernel
 
-EPS = float(ENCODE_EPS)
+EPS = 1.0e-6  # least length and determinant of a frame
 MIN_TANGENT_LENGTH = 1.0e-12  # projected directions shorter than this are treated as zero, in float64
 
 
@@ -40,21 +38,27 @@ def vertex_tangents(vertices: Tensor, faces: Tensor, normals: Tensor, uv: Tensor
     orthogonal to the normal.  No gradient.  Source: Mikkelsen 2008, Simulation of wrinkled surfaces revisited;
     mikktspace.c.
     """
-    vertices, normals, uv = (x.detach().contiguous() for x in (vertices, normals, uv))
+    vertices, normals, uv = (x.detach() for x in (vertices, normals, uv))
     first, label = weld_rows(torch.cat([vertices, normals, uv], 1).cpu().numpy())
     same, count = torch.from_numpy(first[label]).to(vertices.device), len(vertices)
-    corner = torch.empty(3, len(faces), 4, dtype=torch.float64, device=vertices.device)
-    side = torch.empty(3, len(faces), dtype=torch.int32, device=vertices.device)
-    ins = [vertices, normals, uv, faces.contiguous()]
-    launch(corner_tangents_kernel, len(faces), [*ins, same.int(), corner, side], vertices.device)
-    side, weighted = side.flatten(), corner.flatten(0, 1).T.contiguous()
+    corner = faces.T.long()
+    # float64, as differences of float32 values cancel; vectors are columns: torch sums a short last axis slowly
+    normal = _unit(normals.double().T.contiguous())[0]
+    p, n, st = vertices.double().T[:, corner], normal[:, corner], uv.double().T[:, corner]  # (3 or 2, 3 corners, F)
+    (s0, s1), (t0, t1) = st[:, 1] - st[:, 0], st[:, 2] - st[:, 0]
+    area = s0 * t1 - s1 * t0  # negative unless mirrored, as v points down
+    along_u = (p[:, 1] - p[:, 0]) * t1 - (p[:, 2] - p[:, 0]) * s1
+    along_u = _unit(torch.where(area < 0, -along_u, along_u))[0][:, None]
+    one, other = (_unit(_flat(p.roll(step, 1) - p, n))[0] for step in (-1, 1))
+    angle = torch.where(area != 0, (one * other).sum(0).clamp(-1, 1).acos(), 0.0)
+    weighted = torch.cat([_unit(_flat(along_u, n))[0] * angle, angle[None]]).flatten(1)
+    side = (same[corner] + count * (area >= 0)).flatten()
     # unmirrored, then mirrored; index_add_ is about 10 times slower
     total = torch.stack([torch.bincount(side, part, 2 * count) for part in weighted])
-    n = _unit(normals.double().T.contiguous())[0]  # vectors are columns: torch sums a short last axis slowly
     upright, mirrored = total[:, :count][:, same], total[:, count:][:, same]
     flip = mirrored[3] > upright[3]
     tangent, length = _unit(torch.where(flip, mirrored, upright)[:3])
-    tangent = torch.where(length > MIN_TANGENT_LENGTH, _unit(_flat(tangent, n))[0], _any_orthogonal(n))
+    tangent = torch.where(length > MIN_TANGENT_LENGTH, _unit(_flat(tangent, normal))[0], _any_orthogonal(normal))
     return torch.cat([tangent, torch.where(flip, -1.0, 1.0).to(tangent)[None]]).T.to(torch.float32).contiguous()
 
 
@@ -83,12 +87,14 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     """
     _check_frame(normal, tangent)
     check("world", world, last=3, like=normal)
-    batch = torch.broadcast_shapes(world.shape[:-1], normal.shape[:-1], tangent.shape[:-1])
-    parts = (world, normal.detach(), tangent.detach())
-    ins = [v.expand(*batch, v.shape[-1]).reshape(-1, v.shape[-1]) for v in parts]
-    n = len(ins[0])
-    (out,) = call(encode_normals_kernel, n, ins, [(n,)])
-    return out.view(*batch, 3)
+    t, b, n = _frame(normal.detach(), tangent.detach())
+    tt, tn, nn, wt, wn, wb, bb = (
+        (x * y).sum(-1) for x, y in ((t, t), (t, n), (n, n), (world, t), (world, n), (world, b), (b, b))
+    )
+    determinant = (tt * nn - tn * tn).clamp(min=EPS)
+    z = ((tt * wn - tn * wt) / determinant).clamp(min=0.0)
+    local = torch.stack(torch.broadcast_tensors((nn * wt - tn * wn) / determinant, wb / bb.clamp(min=EPS), z), -1)
+    return torch.nn.functional.normalize(local, dim=-1, eps=EPS) * 0.5 + 0.5
 
 
 def decode_normals(encoded: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:

@@ -9,10 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-
-from reli3d._bridge import launch
-from reli3d.kernels import topology as kernels
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 
 @dataclass(frozen=True)
@@ -70,10 +68,9 @@ def graph_components(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
         raise ValueError(f"b: expected shape (L,) as a, got {a.shape} and {b.shape}")
     if len(a) and not (min(a.min(), b.min()) >= 0 and max(a.max(), b.max()) < count):
         raise ValueError(f"a, b: expected nodes in [0, {count}), got others")
-    parent = torch.arange(count, dtype=torch.int32, device="cpu")
-    ends = [torch.from_numpy(np.ascontiguousarray(v, dtype=np.int32)) for v in (a, b)]
-    launch(kernels.components_kernel, 1, [*ends, parent], parent.device)
-    return parent.numpy()
+    graph = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(count, count))
+    label = connected_components(graph, directed=False)[1]
+    return np.unique(label, return_index=True)[1][label].astype(np.int32)
 
 
 def weld_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

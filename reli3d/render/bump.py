@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.linalg import cross
+from torch.nn.functional import normalize
 
-from reli3d._bridge import call, check
-from reli3d.kernels.bump import radial_bump_kernel
+from reli3d._bridge import check
+
+EPS = 1.0e-7  # least length of an axis
 
 
 def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
@@ -20,7 +23,8 @@ def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
     values = (position.detach(), normal.detach(), bump)
     for name, value in zip(("position", "normal", "bump"), values, strict=True):
         check(name, value, last=3, like=bump, dtype=value.dtype)
-    ins = [v.float().reshape(-1, 3) for v in torch.broadcast_tensors(*values)]
-    n = len(ins[0])
-    (out,) = call(radial_bump_kernel, n, ins, [(n,)])
-    return out.view(torch.broadcast_shapes(*(v.shape for v in values)))
+    p, n, b = (v.float() for v in torch.broadcast_tensors(*values))
+    around = torch.stack([p[..., 2], torch.zeros_like(p[..., 0]), -p[..., 0]], -1)
+    tangent = normalize(cross(n, cross(around, n)), dim=-1, eps=EPS)
+    bitangent = normalize(cross(n, tangent), dim=-1, eps=EPS)
+    return normalize(tangent * b[..., :1] + bitangent * b[..., 1:2] + n * b[..., 2:], dim=-1, eps=EPS)

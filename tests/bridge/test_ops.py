@@ -288,7 +288,7 @@ def test_no_kernel_is_left_out(monkeypatch):
     found = set()
     for module in pkgutil.iter_modules(kernels.__path__):
         # of data; CPU alone; of counts
-        if module.name not in ("noise", "distance", "charts", "topology", "allocation"):
+        if module.name not in ("noise", "distance", "charts", "allocation"):
             values = vars(importlib.import_module(f"reli3d.kernels.{module.name}")).values()
             found |= {v.key for v in values if isinstance(v, wp.Kernel)}
     assert found - launched == {

@@ -359,11 +359,11 @@ CASES = {
         lambda n: {"c2w": rig("cpu").c2w, "intrinsics": rig("cpu").intrinsics}, posed, ("c2w", "intrinsics"),
         second=("c2w", "intrinsics")),
     "radial_bump": Case(
-        lambda n: {"bump": above(n, 1)}, bumped, ("bump",), ("bump",), dtypes=("bump",)),
+        lambda n: {"bump": above(n, 1)}, bumped, ("bump",), ("bump",), second=("bump",), dtypes=("bump",)),
     "encode_normals": Case(
         lambda n: {"world": units(n, 1)},
         lambda world: (encode_normals(world, *(v[: len(world)].to(world.device) for v in FRAME.values())),), ("world",),
-        ("world",)),
+        ("world",), second=("world",)),
     "decode_normals": Case(
         lambda n: {"encoded": 0.5 + 0.5 * above(n, 1)},
         lambda encoded: (decode_normals(encoded, *(v[: len(encoded)].to(encoded.device) for v in FRAME.values())),),

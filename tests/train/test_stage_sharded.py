@@ -13,18 +13,21 @@ from reli3d.train.stages.stage import PaperStage
 from reli3d.train.stages.step import trunk_layers
 from reli3d.train.stages.views import Samples
 from tests.support.processes import on_two
-from tests.support.stages import ball_model, numbers, write_samples
+from tests.support.stages import ball_model, numbers
 
 CONFIG = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, steps=4, rate=1e-3)
 STEPS = dict(warmup=2, save_every=2, log_every=1)
 WORKER = """
+import copy
 import gc
 import json
 import sys
 from pathlib import Path
 import torch
+from torch import nn
 from torch.distributed.tensor import DTensor
 from reli3d.train.loop import train
+from reli3d.train.sharded import clip_gradients, gathered, scattered, shard
 from reli3d.train.stages.config import StageConfig
 from reli3d.train.stages.stage import PaperStage
 from reli3d.train.stages.views import Samples
@@ -45,41 +48,35 @@ def record_shards():
     moments = [v for s in optimizer.state.values() for v in s.values() if isinstance(v, DTensor)]
     here = [sum(t.to_local().numel() for t in ts) / sum(t.numel() for t in ts) for ts in (cut, moments)]
     Path(out, f"shards.{workers.rank}").write_text(json.dumps([len(cut), *here]))
+def check_clipping():
+    torch.manual_seed(0)
+    whole = nn.Sequential(nn.Linear(5, 7), nn.Linear(7, 3))
+    cut = copy.deepcopy(whole)
+    shard([cut[0]], torch.device("cpu"))
+    x = torch.randn(4, 5)
+    for model in (whole, cut):
+        model(x).square().sum().backward()
+    for limit in (1e3, 0.1):  # not reached, reached
+        expected = nn.utils.clip_grad_norm_(whole.parameters(), limit)
+        torch.testing.assert_close(clip_gradients(list(cut.parameters()), limit), expected)
+        for a, b in zip(whole.parameters(), cut.parameters()):
+            torch.testing.assert_close(gathered(b.grad, True), a.grad)
+    for a, b in zip(whole.parameters(), cut.parameters()):
+        assert torch.equal(gathered(scattered(a.detach() + 1, b), True), a.detach() + 1)
+    Path(out).mkdir(exist_ok=True)
+    Path(out, f"clipped.{workers.rank}").touch()
 config = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, steps=4, rate=1e-3)
 workers = Workers.join()
+check_clipping()
 stage = Stops(ball_model(), config, [Samples(Path(folder))], checkpointing=True)
 train(stage, stage.options(out, warmup=2, save_every=2, log_every=1, shard=True), workers)
 workers.leave()
 """
 
-CLIP = """
-import copy
-import torch
-from torch import nn
-from reli3d.train.sharded import clip_gradients, gathered, scattered, shard
-from reli3d.train.workers import Workers
-workers = Workers.join()
-torch.manual_seed(0)
-whole = nn.Sequential(nn.Linear(5, 7), nn.Linear(7, 3))
-cut = copy.deepcopy(whole)
-shard([cut[0]], torch.device("cpu"))
-x = torch.randn(4, 5)
-for model in (whole, cut):
-    model(x).square().sum().backward()
-for limit in (1e3, 0.1):  # not reached, reached
-    expected = nn.utils.clip_grad_norm_(whole.parameters(), limit)
-    torch.testing.assert_close(clip_gradients(list(cut.parameters()), limit), expected)
-    for a, b in zip(whole.parameters(), cut.parameters()):
-        torch.testing.assert_close(gathered(b.grad, True), a.grad)
-for a, b in zip(whole.parameters(), cut.parameters()):
-    assert torch.equal(gathered(scattered(a.detach() + 1, b), True), a.detach() + 1)
-workers.leave()
-"""
-
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return write_samples(tmp_path_factory.mktemp("sharded"))
+def folder(small_samples):
+    return small_samples
 
 
 def alone(folder, out, stop=None):
@@ -155,7 +152,7 @@ def test_one_process_alone_is_refused(folder, tmp_path, capsys):
     assert "shard: expected several processes" in capsys.readouterr().err
 
 
-def test_norms_and_parts_are_those_of_whole_gradients(tmp_path):
+def test_norms_and_parts_are_those_of_whole_gradients(runs):
     """Against torch's own clipping of the whole module, on the same input on both processes."""
-    (tmp_path / "clip.py").write_text(CLIP)
-    on_two(tmp_path / "clip.py")
+    root, _ = runs
+    assert all((root / "first" / f"clipped.{rank}").exists() for rank in range(2))
