@@ -27,15 +27,15 @@ from reli3d.train.stages.stage import PaperStage, averaged
 from reli3d.train.stages.step import checkpointed, object_losses, total
 from reli3d.train.stages.views import Samples, draw
 from tests.support.processes import ENVIRONMENT
-from tests.support.stages import SMALL, BallModel, ball_model, numbers, rows, write_samples
+from tests.support.stages import SMALL, BallModel, ball_model, numbers, rows
 
 GAUSSIANS = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, steps=6, rate=1e-3)
 SIZES = dict(inputs=2, targets=1, background=0.5, input_size=32, target_size=16, patch=0)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return write_samples(tmp_path_factory.mktemp("loop"))
+def folder(small_samples):
+    return small_samples
 
 
 def stage_of(folder, model=None, config=GAUSSIANS, **options):

@@ -20,7 +20,7 @@ from reli3d.train.stages.step import encode, object_losses, renderings, shader_o
 from reli3d.train.stages.surface import render_surface, surface
 from reli3d.train.stages.views import ObjectViews, Samples, draw
 from reli3d.train.stages.volume import occupied, render_volume
-from tests.support.stages import RADIUS, ball_model, camera, write_samples
+from tests.support.stages import RADIUS, ball_model, camera
 
 VOLUME = StageConfig("volume", "volume", 24, patch=16, lobes=32, grid=8, samples_along=48)
 GAUSSIANS = StageConfig("gaussians", "gaussians", 24, lobes=32)
@@ -29,8 +29,8 @@ SIZES = dict(inputs=2, targets=1, background=0.5, input_size=32, target_size=24,
 
 
 @pytest.fixture(scope="module")
-def source(tmp_path_factory):
-    return Samples(write_samples(tmp_path_factory.mktemp("stages")))
+def source(small_samples):
+    return Samples(small_samples)
 
 
 @pytest.fixture(scope="module")
