@@ -16,16 +16,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, full_precision, launch
+from reli3d._bridge import check, full_precision
 from reli3d.geometry.camera import Camera, project
 from reli3d.geometry.mesh import weld
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.topology import edges_of
-from reli3d.kernels import silhouette as kernels
 
+DEPTH_MIN = 1e-6  # nearer ends count as behind the eye; their pixel would be beyond any image
 RAY_OFFSET_PIXELS = 0.01  # pixels from the edge to the visibility ray, so that it does not graze the edge's own faces
 IN_FRONT = 1e-3  # fraction of the distance by which an occluder must be nearer; above float32 rounding at folds
 
@@ -165,33 +164,33 @@ def antialias(
 
 
 def _lines(vertices: Tensor, edges: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Edge, pixel line, steepness and direction away from the surface (1 or -1) of every crossing, each ``(M,)``."""
-    n, device = len(edges), vertices.device
-    first, count = (torch.empty(n, dtype=torch.int32, device=device) for _ in range(2))
-    outward = torch.empty(n, device=device, dtype=torch.float32)
-    steep = torch.empty(n, dtype=torch.bool, device=device)
-    c2w, intrinsics = camera.c2w.detach().tolist(), camera.intrinsics.detach().tolist()
-    launch(
-        kernels.outline_kernel,
-        n,
-        [
-            vertices.contiguous(),
-            edges.contiguous(),
-            wp.mat44(*sum(c2w, [])),
-            wp.vec4(*intrinsics),
-            camera.width,
-            camera.height,
-            outward,
-            steep,
-            first,
-            count,
-        ],
-        device,
+    """Edge, pixel line, steepness and direction away from the surface (1 or -1) of every crossing, each ``(M,)``.
+
+    An edge is a silhouette edge if both faces project to the same side of it, regardless of winding.  It is crossed
+    with pixel rows if its projection is steeper than 45 degrees, else with columns, so that no part counts twice.
+    """
+    camera, ends = camera.detach(), edges.long()
+    a, b, c, d = (vertices.detach()[k] for k in (*ends[:, :3].unbind(1), ends[:, 3].clamp(min=0)))
+    normal = torch.linalg.cross(a - camera.position, b - camera.position)  # of the plane through the eye and the edge
+    s = (normal * (c - a)).sum(-1)
+    r = torch.where(ends[:, 3] >= 0, (normal * (d - a)).sum(-1), s)
+    (p, zp), (q, zq) = (project(end, camera.c2w, camera.intrinsics) for end in (a, b))
+    steep = (q - p)[:, 1].abs() > (q - p)[:, 0].abs()
+    low, high = torch.aminmax(
+        torch.where(steep, torch.stack([p[:, 1], q[:, 1]]), torch.stack([p[:, 0], q[:, 0]])), dim=0
     )
-    count = count.long()
-    edge = torch.repeat_interleave(torch.arange(n, device=device, dtype=torch.int64), count)
-    begin = count.cumsum(0) - count
-    line = first.long()[edge] + torch.arange(len(edge), device=device, dtype=torch.int64) - begin[edge]
+    size = torch.where(steep, camera.height, camera.width).to(low)
+    outline = (s * r >= 0.0) & ((s != 0.0) | (r != 0.0)) & (zp > DEPTH_MIN) & (zq > DEPTH_MIN)
+    # lines with a center in [low, high)
+    first, last = (torch.where(outline, (v - 0.5).ceil().clamp(min=0.0).minimum(size), 0.0).long() for v in (low, high))
+    right, up, _ = camera.c2w[:3, :3].unbind(1)
+    towards = torch.where(steep[:, None], right, -up)  # larger x or y of the image
+    outward = torch.where((normal * towards).sum(-1) * (s + r) > 0.0, -1.0, 1.0).to(vertices)
+    count = last - first
+    edge = torch.repeat_interleave(count)
+    line = (
+        first[edge] + torch.arange(len(edge), device=edge.device, dtype=torch.int64) - (count.cumsum(0) - count)[edge]
+    )
     return edge, line, steep[edge], outward[edge]
 
 
