@@ -3,7 +3,7 @@
 A face takes the axis (of six) nearest to its smoothed normal.  Connected faces of one axis are a chart, projected along
 its mean normal.  Topology is that of the welded mesh (equal positions are one vertex).  An edge with one face, or with
 more than two, is a border.  Every step takes a sort or less, so the time is bounded by the number of faces and of
-overlaps.  All runs on the CPU: steps for each face in Warp, steps for each chart in numpy.
+overlaps.  All runs on the CPU, in numpy but for the kernels' steps.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ CUT_GAIN = 0.85  # boxes of the two pieces over the box of the chart, at most ..
 CUT_HOLLOW, CUT_HOLLOW_GAIN = 0.25, 1.02  # ... but a ring gains by the second cut only: no gain needed below this fill
 CUT_ANGLES = 8  # directions in [0, 180) degrees of the cut, and of the boxes that judge it, as in kernels.charts
 ANGLES = 24  # directions in [0, 90) degrees tried for the smallest bounding box of a chart: within 2 degrees of it
-LIGHT = 8192  # faces a CPU slice of the steps that take a few nanoseconds a face: less costs more to launch than to run
 GROW_MAX = 2.0  # a chart seen obliquely is enlarged to its area on the surface, up to this factor
 OVERLAP_TEXELS = 2.0e-3  # texels: overlap below this width is rounding
 PAIRS_MAX = 1 << 24  # overlapping pairs listed at once (64 MB); charts above are halved first
@@ -72,24 +71,25 @@ def _ints(values: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, np.int32))
 
 
-def _floats(values: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.einsum("fk,fk->f", vectors, vectors))
 
 
-def axis_labels(normal: torch.Tensor, neighbors: np.ndarray) -> np.ndarray:
+def axis_labels(normal: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
     """Axis 0..5 (as AXES) of every face, with smooth borders.  ``normal``: (F, 3), length twice the area."""
-    n, links = len(normal), _ints(neighbors)
+    rows, across = np.arange(len(normal)), neighbors >= 0
     smoothed = normal
     for _ in range(NORMAL_ROUNDS):
-        rough, smoothed = smoothed, torch.empty_like(normal)
-        _bridge.launch(kernels.smooth_kernel, n, [links, rough, smoothed], CPU, slice_min=LIGHT)
-    label = torch.empty(n, dtype=torch.int32, device="cpu")
-    _bridge.launch(kernels.labels_kernel, n, [normal, smoothed, COS_LABEL, label], CPU, slice_min=LIGHT)
-    for _ in range(MAJORITY_ROUNDS):
-        voted = torch.empty_like(label)
-        _bridge.launch(kernels.majority_kernel, n, [links, normal, label, COS_LABEL, voted], CPU, slice_min=LIGHT)
-        label = voted
-    return label.numpy()
+        smoothed = smoothed + np.einsum("fik,fi->fk", smoothed[neighbors], across)
+    along = np.concatenate([normal, -normal], 1)
+    fits = along >= COS_LABEL * _lengths(normal)[:, None]
+    label = np.concatenate([smoothed, -smoothed], 1).argmax(1)
+    label = np.where(fits[rows, label], label, along.argmax(1)).astype(np.int32)
+    for _ in range(MAJORITY_ROUNDS):  # the label of two or three neighbors
+        a, b, c = np.where(across, label[neighbors], -1).T
+        winner = np.where((a == b) | (a == c), a, np.where(b == c, b, -1))
+        label = np.where((winner >= 0) & fits[rows, winner], winner, label)
+    return label
 
 
 def merge_small(label: np.ndarray, normal: np.ndarray, neighbors: np.ndarray, least: float) -> np.ndarray:
@@ -97,7 +97,7 @@ def merge_small(label: np.ndarray, normal: np.ndarray, neighbors: np.ndarray, le
 
     Of several such neighbors the one with the most common edges is chosen; repeats while charts merge.
     """
-    area = np.sqrt(np.einsum("fk,fk->f", normal, normal)) * 0.5
+    area = _lengths(normal) * 0.5
     for _ in range(MERGE_ROUNDS):
         chart, count = components(neighbors, label)
         total = np.bincount(chart, area, count)
@@ -118,28 +118,22 @@ def merge_small(label: np.ndarray, normal: np.ndarray, neighbors: np.ndarray, le
     return label
 
 
-def _frames(normal: torch.Tensor, label: np.ndarray, chart: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _frames(normal: np.ndarray, label: np.ndarray, chart: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Right and up vectors ``(N, 3)`` of the plane of each chart, with the factor that keeps its area."""
-    array = normal.numpy()
-    total = np.stack([np.bincount(chart, array[:, k], count) for k in range(3)], 1)
+    total = np.stack([np.bincount(chart, normal[:, k], count) for k in range(3)], 1)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     toward = total / np.maximum(length, 1e-300)
-    oblique = torch.zeros(count, dtype=torch.uint8, device="cpu")
-    _bridge.launch(
-        kernels.oblique_kernel,
-        len(chart),
-        [normal, _ints(chart), _floats(toward), COS_TILT, oblique],
-        CPU,
-        slice_min=LIGHT,
-    )
+    size = _lengths(normal)
+    oblique = np.zeros(count, bool)
+    oblique[chart[np.einsum("fk,fk->f", normal, toward[chart]) < COS_TILT * size]] = True
     axis = np.zeros((count, 3))
     axis[chart] = AXES[label]  # one label in a chart
-    toward = np.where((oblique.numpy()[:, None] > 0) | (length < 1e-20), axis, toward)
+    toward = np.where(oblique[:, None] | (length < 1e-20), axis, toward)
     helper = AXES[np.where(np.abs(toward[:, 1]) < 0.9, 1, 0)]  # world up on the page where there is one
     right = np.cross(helper, toward)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     seen = np.einsum("ck,ck->c", total, toward)
-    area = np.bincount(chart, np.sqrt(np.einsum("fk,fk->f", array, array)), count)
+    area = np.bincount(chart, size, count)
     grow = np.minimum(np.sqrt(area / np.maximum(seen, 1e-300)), GROW_MAX)[:, None]
     return right * grow, np.cross(toward, right) * grow
 
@@ -323,15 +317,14 @@ def make_charts(
     center = 0.5 * (points.min(0).astype(np.float64) + points.max(0))
     reach = np.abs(points - center).max() or 1.0
     local = ((points - center) / reach).astype(np.float32)  # at most 1: products cannot overflow
-    normal = torch.empty(len(faces), 3, dtype=torch.float32, device="cpu")
-    _bridge.launch(kernels.normals_kernel, len(faces), [_floats(local), _ints(faces), normal], CPU, slice_min=LIGHT)
-    size = 0.5 * np.sqrt(np.einsum("fk,fk->f", normal.numpy(), normal.numpy(), dtype=np.float64))
+    a, b, c = (local[faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    size = 0.5 * np.sqrt(np.einsum("fk,fk->f", normal, normal, dtype=np.float64))
     area = float(size.sum())
     unit = np.sqrt(texels / area) if area > 1e-30 else 0.0
-    local, size = local * np.float32(unit), size * unit**2
-    normal = torch.from_numpy(normal.numpy() * np.float32(unit * unit))
+    local, size, normal = local * np.float32(unit), size * unit**2, normal * np.float32(unit * unit)
     neighbors = face_neighbors(faces)
-    label = merge_small(axis_labels(normal, neighbors), normal.numpy(), neighbors, least_texels)
+    label = merge_small(axis_labels(normal, neighbors), normal, neighbors, least_texels)
     chart, count = components(neighbors, label)
     right, up = _frames(normal, label, chart, count)
     centers = local[faces].mean(1).astype(np.float64)
@@ -346,13 +339,11 @@ def make_charts(
     outer = outer_faces(chart, neighbors)
     tips = local[faces[outer]].reshape(-1, 3).astype(np.float64)
     right, up, low = _upright(right, up, tips, np.repeat(chart[outer], 3))
-    corners, flat = (
-        torch.empty(len(faces), 3, 2, dtype=torch.float32, device="cpu"),
-        torch.empty(len(faces), dtype=torch.uint8, device="cpu"),
-    )
-    _bridge.launch(kernels.project_kernel, len(faces), [
-        _floats(local), _ints(faces), _ints(chart), _floats(right), _floats(up),
-        _floats(low), sliver, corners, flat], CPU, slice_min=LIGHT)  # fmt: skip
-    charts = Charts(np.where(flat.numpy() > 0, -1, chart).astype(np.int32), corners.numpy(), neighbors, count)
+    plane = np.stack([right, up], 2).astype(np.float32)[chart]
+    corners = local[faces] @ plane - low.astype(np.float32)[chart][:, None]
+    (ax, ay), (bx, by) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+    longest = np.sqrt(np.maximum(np.maximum(ax**2 + ay**2, bx**2 + by**2), (bx - ax) ** 2 + (by - ay) ** 2))
+    flat = ~(ax * by - ay * bx > sliver * longest)  # lower than ``sliver``, or turned over
+    charts = Charts(np.where(flat, -1, chart).astype(np.int32), corners, neighbors, count)
     split_overlaps(charts)
     return charts
