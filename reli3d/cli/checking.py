@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -73,7 +72,3 @@ def main(argv: list[str] | None = None) -> int:
         entries = [asdict(row) | job.found.get(row.object, {}) for row in ended]
         print(json.dumps({"objects": entries, "exit_code": code}))
     return code
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -8,7 +8,6 @@ import os
 import platform
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -150,7 +149,3 @@ def main(argv: list[str] | None = None) -> int:
 
 def aligned(rows: Sequence[tuple[str, str]]) -> str:
     return "\n".join(f"{name:16s} {value}" for name, value in rows)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

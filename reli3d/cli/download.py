@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 from reli3d.cli.exit_codes import Parser, command
 
 
@@ -22,7 +20,3 @@ def main(argv: list[str] | None = None) -> int:
 
     print(hub.fetch_official())
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

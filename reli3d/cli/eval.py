@@ -71,7 +71,3 @@ def main(argv: list[str] | None = None) -> int:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(args.json, f"{text}\n".encode())
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

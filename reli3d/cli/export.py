@@ -102,7 +102,3 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
         write_bytes(args.output / file, data)
     record = {"triangles": len(asset.mesh.faces), "texture_size": asset.textures.size}
     return [args.output / file for file in files], record
-
-
-if __name__ == "__main__":
-    sys.exit(main())

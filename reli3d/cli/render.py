@@ -313,7 +313,3 @@ def _write_aovs(stem: Path, image) -> list[Path]:
         paths.append(stem.with_name(f"{stem.name}_{name}.exr"))
         write_exr(paths[-1], layer.cpu(), half=False)
     return paths
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -64,7 +64,3 @@ def main(argv: list[str] | None = None) -> int:
     write_png(args.output / "sheet.png", sheet)
     print(text, end="")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

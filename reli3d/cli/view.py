@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import functools
 import http.server
-import sys
 import webbrowser
 from pathlib import Path
 from urllib.parse import quote
@@ -69,7 +68,3 @@ def main(argv: list[str] | None = None) -> int:
             webbrowser.open(url)
         server.serve_forever()
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
