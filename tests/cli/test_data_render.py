@@ -14,7 +14,7 @@ from reli3d.cli import data, objects
 from reli3d.render.latlong import lat_long_directions
 from tests.support.checkout import ROOT
 
-COUNT = 6
+COUNT = 4
 SLOW = pytest.mark.slow  # a cluster of Ray takes half a minute to start
 PLACES = [pytest.param(["--workers", "2"], id="processes"), pytest.param(["--ray", "local"], id="ray", marks=SLOW)]
 

@@ -1,5 +1,6 @@
 """The documents: every Python block runs, every link and path leads somewhere."""
 
+import json
 import os
 import re
 import shutil
@@ -42,6 +43,9 @@ WITH_CODE = [page for page in PAGES if any(not FILE.match(code.lstrip("\n")) for
 def folder(tmp_path, monkeypatch) -> Path:
     """Working folder with the files of a reader: an object folder ``photos/shoe`` and a light ``studio.hdr``."""
     shutil.copytree(Path(reli3d.__file__).parent / "assets" / "example", tmp_path / "photos" / "shoe")
+    cameras = tmp_path / "photos" / "shoe" / "transforms.json"
+    data = json.loads(cameras.read_text())
+    cameras.write_text(json.dumps({**data, "frames": data["frames"][:4]}))  # of twelve, for time
     write_environment(
         tmp_path / "studio.hdr", Environment(torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(0)))
     )
