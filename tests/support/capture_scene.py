@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,7 @@ class TrueCapture:
         return folder
 
 
+@cache
 def scene_surface(seed: int, table_yaw: float = 0.0, table: float = TABLE) -> tuple[ObjectSurface, int]:
     """Object and table, and the number of the object's faces.
 
