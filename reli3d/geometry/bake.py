@@ -298,6 +298,6 @@ def dilate(
 
 def _fill(value: Tensor, source: Tensor, square: Tensor, limit: float = float("inf")) -> None:
     """Copy texels of ``value (H, W, C)``, in place, from those that :func:`nearest_valid` found within ``limit``."""
-    nearest = source.reshape(-1), square.reshape(-1)
     flat = value.view(-1, value.shape[2])
-    _bridge.launch(kernels.fill_kernel, len(flat), [*nearest, limit, flat.shape[1], flat], value.device)
+    rows = ((source >= 0) & (square > 0.0) & (square <= limit)).reshape(-1).nonzero().squeeze(1)
+    flat.index_copy_(0, rows, flat.index_select(0, source.reshape(-1)[rows]))

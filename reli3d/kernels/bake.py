@@ -247,22 +247,3 @@ def nearest_texel_kernel(
             r = row[i, v]
             source[i, x] = r * width + v
             square[i, x] = float((r - i) * (r - i) + (x - v) * (x - v))
-
-
-@wp.kernel
-def fill_kernel(
-    start: int,
-    # in
-    source: wp.array[wp.int32],
-    square: wp.array[float],
-    limit: float,
-    channels: int,
-    # in and out
-    values: wp.array2d[float],
-):
-    """Copy the channels of ``source[i]`` to texel ``i``, which differ where it is not valid, up to a distance."""
-    i = start + wp.tid()
-    j = source[i]
-    if j >= 0 and j != i and square[i] <= limit:
-        for c in range(channels):
-            values[i, c] = values[j, c]

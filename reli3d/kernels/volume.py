@@ -87,7 +87,7 @@ def step_thickness(density: float, step: float) -> float:
 
 
 @wp.kernel
-def count_samples_kernel(
+def samples_kernel(
     start: int,
     # in
     occupied: wp.array3d[wp.uint8],
@@ -98,53 +98,29 @@ def count_samples_kernel(
     step: float,
     near: float,
     far: float,
-    # out
-    count: wp.array[wp.int32],
-):
-    i = start + wp.tid()
-    o = origins[i]
-    d = directions[i]
-    total = wp.int32(0)
-    s = shift[i % shift.shape[0]]
-    r = cube_range(o, d, radius, near, far)
-    k = next_sample(occupied, o, d, r, radius, step, s, 0)
-    while k >= 0:
-        total = total + 1
-        k = next_sample(occupied, o, d, r, radius, step, s, k + 1)
-    count[i] = total
-
-
-@wp.kernel
-def emit_samples_kernel(
-    start: int,
-    # in
-    occupied: wp.array3d[wp.uint8],
-    origins: wp.array[wp.vec3],
-    directions: wp.array[wp.vec3],
-    shift: wp.array[float],
-    radius: float,
-    step: float,
-    near: float,
-    far: float,
+    emit: int,
     first: wp.array[wp.int32],
     # out
-    ray: wp.array[wp.int32],
+    count: wp.array[wp.int32],
     t: wp.array[float],
 ):
+    """Count (``emit`` 0) or list (1, from ``first[i]``) the samples of ray ``i``."""
     i = start + wp.tid()
-    row = first[i]
-    end = first[i + 1]
-    if row < end:
-        o = origins[i]
-        d = directions[i]
-        s = shift[i % shift.shape[0]]
-        r = cube_range(o, d, radius, near, far)
-        k = next_sample(occupied, o, d, r, radius, step, s, 0)
-        while k >= 0 and row < end:
-            ray[row] = i
-            t[row] = r[0] + (float(k) + s) * step
-            row = row + 1
-            k = next_sample(occupied, o, d, r, radius, step, s, k + 1)
+    if emit == 1 and count[i] == 0:
+        return
+    o = origins[i]
+    d = directions[i]
+    s = shift[i % shift.shape[0]]
+    r = cube_range(o, d, radius, near, far)
+    total = wp.int32(0)
+    k = next_sample(occupied, o, d, r, radius, step, s, 0)
+    while k >= 0 and (emit == 0 or total < count[i]):
+        if emit == 1:
+            t[first[i] + total] = r[0] + (float(k) + s) * step
+        total = total + 1
+        k = next_sample(occupied, o, d, r, radius, step, s, k + 1)
+    if emit == 0:
+        count[i] = total
 
 
 @wp.kernel

@@ -129,14 +129,15 @@ def march_rays(
     ]
     numbers = [float(grid.radius), float(step), float(near), float(min(far, 3.0e38))]
     count = torch.zeros(n, dtype=torch.int32, device=device)
-    launch(kernels.count_samples_kernel, n, [*rays, *numbers, count], device)
+    none = torch.empty(0, dtype=torch.int32, device=device), torch.empty(0, dtype=torch.float32, device=device)
+    launch(kernels.samples_kernel, n, [*rays, *numbers, 0, none[0], count, none[1]], device)
     total = torch.nn.functional.pad(count.long().cumsum(0), (1, 0))
     if int(total[-1]) >= 2**31:
         raise ValueError(f"step: expected fewer than 2**31 samples, got {int(total[-1])}")
     first = total.int()
-    ray = torch.empty(int(total[-1]), dtype=torch.int32, device=device)
-    t = torch.empty(int(total[-1]), device=device, dtype=torch.float32)
-    launch(kernels.emit_samples_kernel, n, [*rays, *numbers, first, ray, t], device)
+    ray = torch.arange(n, dtype=torch.int32, device=device).repeat_interleave(count, output_size=int(total[-1]))
+    t = torch.empty(len(ray), device=device, dtype=torch.float32)
+    launch(kernels.samples_kernel, n, [*rays, *numbers, 1, first, count, t], device)
     return RaySamples(ray, t, first, float(step))
 
 
