@@ -1,5 +1,5 @@
 """Counter-based random numbers: a pure function of (seed, pixel, sample, dimension), so results do not depend on
-chunking, on threads or on order.  Also Halton points and their Cranley-Patterson rotation.
+chunking, on threads or on order.  Also the Cranley-Patterson rotation of points.
 """
 
 import warp as wp
@@ -53,43 +53,3 @@ def rotate_point(point: wp.vec2, shift: wp.vec2) -> wp.vec2:
     x = point[0] + shift[0]
     y = point[1] + shift[1]
     return wp.vec2(wp.min(x - wp.floor(x), 1.0 - TO_UNIT), wp.min(y - wp.floor(y), 1.0 - TO_UNIT))
-
-
-@wp.func
-def radical_inverse(index: int, base: int) -> float:
-    """Digits of ``index`` in ``base``, mirrored at the radix point; in [0, 1).  Halton 1960 takes bases 2 and 3."""
-    inverse = 1.0 / float(base)
-    scale = wp.float32(inverse)
-    value = wp.float32(0.0)
-    rest = wp.int32(index)
-    while rest > 0:
-        value = value + float(rest % base) * scale
-        scale = scale * inverse
-        rest = rest // base
-    return wp.min(value, 1.0 - TO_UNIT)
-
-
-@wp.kernel
-def random_pair_kernel(
-    start: int,
-    # in
-    seed: int,
-    sample: int,
-    dimension: int,
-    # out
-    u: wp.array[wp.vec2],
-):
-    i = start + wp.tid()
-    u[i] = random_pair(seed, i, sample, dimension)
-
-
-@wp.kernel
-def halton_kernel(
-    start: int,
-    # in
-    first: int,
-    # out
-    u: wp.array[wp.vec2],
-):
-    i = start + wp.tid()
-    u[i] = wp.vec2(radical_inverse(first + i, 2), radical_inverse(first + i, 3))

@@ -1,16 +1,19 @@
-"""Sampling of directions in the local frame (normal +z), their densities, and random numbers.
+"""Sampling of directions in the local frame (normal +z), their densities, and Halton points.
 
 Samplers take ``u``, uniform in [0, 1)^2.  Leading axes broadcast; tensors are float32 on one device.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
+
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import call, check, empty, launch
-from reli3d.kernels import microfacet, random
+from reli3d.kernels import microfacet
 from reli3d.kernels import sampling as kernels
 
 
@@ -131,22 +134,14 @@ def reflect(wo: Tensor, wm: Tensor) -> Tensor:
     return 2.0 * (wo * wm).sum(-1, keepdim=True) * wm - wo
 
 
-def random_pairs(
-    count: int, *, seed: int = 0, sample: int = 0, dimension: int = 0, device: torch.device | str = "cpu"
-) -> Tensor:
-    """Uniform ``u (count, 2)`` in [0, 1): row i is a hash of only (i, sample, dimension, seed).
-
-    Source: pcg4d of Jarzynski and Olano 2020, the first two of its four words, 24 bits each.
-    """
-    out = empty((count,), wp.vec2, torch.device(device))
-    launch(random.random_pair_kernel, count, [int(seed) & 0x7FFFFFFF, int(sample), int(dimension), out], out.device)
-    return out
-
-
-def halton(count: int, *, first: int = 1, device: torch.device | str = "cpu") -> Tensor:
-    """Points ``first`` to ``first + count - 1`` of the Halton sequence in bases 2 and 3, ``(count, 2)`` in [0, 1)."""
-    if first < 0 or count < 0:
-        raise ValueError(f"first, count: expected at least 0, got {first}, {count}")
-    out = empty((count,), wp.vec2, torch.device(device))
-    launch(random.halton_kernel, count, [int(first), out], out.device)
-    return out
+@lru_cache(16)
+def halton(count: int) -> Tensor:
+    """Points 1 to ``count`` of the Halton sequence in bases 2 and 3, ``(count, 2)`` in [0, 1), on the CPU."""
+    points = np.zeros((count, 2))
+    for axis, base in enumerate((2, 3)):
+        rest, scale = np.arange(1, count + 1), 1.0
+        while rest.any():  # the digits, mirrored at the radix point
+            scale /= base
+            points[:, axis] += rest % base * scale
+            rest //= base
+    return torch.from_numpy(points.astype(np.float32).clip(max=1.0 - 2.0**-24))

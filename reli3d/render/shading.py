@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -324,9 +323,4 @@ def sampling_plan(options: ShadeOptions, scene: RayScene | None) -> tuple[kernel
     plan.seed = int(options.seed) & 0x7FFFFFFF
     plan.clamp = float("inf") if options.clamp is None else float(options.clamp)
     plan.scale = 0.0 if scene is None else scene.scale
-    return plan, _halton(max(1, *options.samples))
-
-
-@lru_cache(16)
-def _halton(count: int) -> Tensor:
-    return halton(count)
+    return plan, halton(max(1, *options.samples))

@@ -160,8 +160,7 @@ def meshes():
 def draws():
     normal = units(ROWS, 1)
     return (
-        sampling.random_pairs(ROWS, seed=3, device=torch.device("cpu")),
-        sampling.halton(ROWS, device=torch.device("cpu")),
+        sampling.halton(ROWS),
         material.sample_bsdf(normal, numbers(ROWS)[:, 0].contiguous(), numbers(ROWS), lobe="mirrored"),
         transfer.light_harmonics(lights.LIGHTS["studio"](16)),
         transfer.blocked_transfer(ball().with_normals(), directions=16),

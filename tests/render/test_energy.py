@@ -84,7 +84,7 @@ def view(cos_o, device):
 def test_neither_specular_nor_diffuse_nor_metal_gains_energy(device, alpha):
     """Each alone, the published diffuse model too.  Coat and published diffuse lobe of a white dielectric together may:
     the lobe loses the energy of the microfacets, not that of the coat (docs/results.md)."""
-    u = halton(1 << 16, device=device)
+    u = halton(1 << 16).to(device)
     width, one = torch.tensor(alpha, device=device), torch.ones((), device=device)
     for cos_o in (0.02, *COSINES):
         metal, white, coat = (
@@ -97,7 +97,7 @@ def test_neither_specular_nor_diffuse_nor_metal_gains_energy(device, alpha):
 def test_no_surface_sends_out_more_than_comes_in(device):
     """By default: three base colors at once, of any metallic, from a mirror to the roughest, down to the horizon."""
     n = 1 << 14  # Halton points
-    u = halton(n, device=device)
+    u = halton(n).to(device)
     number = lambda v: torch.tensor(float(v), device=device)  # noqa: E731
     base = torch.tensor([1.0, 0.5, 0.9], device=device)
     highest, dielectric = 0.0, []
@@ -168,7 +168,7 @@ def test_a_white_surface_in_the_furnace_of_the_shader(device):
             wo = view(cos_o, device).expand(n, 3).contiguous()
             points = on_ball(normal, wo, torch.ones_like(wo), one * roughness, one * 0.0)
             shown = lit(points, light)[:, 0].double()
-            u = halton(1 << 16, device=device)
+            u = halton(1 << 16).to(device)
             expected = albedo(view(cos_o, device), one[0] * roughness**2, one[:3], one[0] * 0, u)[0]
             got, noise = shown.mean(), shown.std() / n**0.5
             assert abs(got - expected) < 4 * noise + 2e-4 and got < 1.0 + 1e-3  # 2e-4: of the points in the quadrature

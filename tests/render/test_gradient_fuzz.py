@@ -13,7 +13,6 @@ from reli3d.render.asset import TextureSet
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from reli3d.render.material import DIFFUSE_MODELS, eval_bsdf, sample_bsdf
-from reli3d.render.sampling import random_pairs
 from tests.support import reference
 from tests.support.surfaces import at, lit
 
@@ -138,7 +137,7 @@ def test_gradients_of_the_estimator(device, strategy, diffuse_model):
     seed, count = 7, 2
     draws, density = [], []
     for k in range(count):
-        u = random_pairs(N, seed=seed, sample=k, dimension=int(strategy == "visible"))
+        u = reference.random_pairs(N, seed=seed, sample=k, dimension=int(strategy == "visible"))
         d, p = Environment(texels).sample(u) if strategy == "map" else world_directions(normal, ng, wo, alpha, u)
         draws.append(d.double()), density.append(p.double())
     exact = [v.double() for v in (ng, wo)]

@@ -123,8 +123,6 @@ def drawn(u, radiance, wo, alpha):
         light.pdf(wi),
         wi,
         material.pdf_lobes(wo, alpha, wi),
-        sampling.random_pairs(len(u), seed=4, device=u.device),
-        sampling.halton(len(u), device=u.device),
         offset_origin(wo, wi, directions),
     )
 

@@ -5,8 +5,20 @@ Directions are in the local frame, normal +z.  Shapes ``(..., 3)`` and ``(...)``
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
+
+
+def random_pairs(count: int, *, seed: int = 0, sample: int = 0, dimension: int = 0) -> Tensor:
+    """The shader's random numbers ``(count, 2)``: pcg4d of Jarzynski and Olano 2020, 24 bits of its first two words."""
+    v = [np.arange(count, dtype=np.uint32), *(np.full(count, k, np.uint32) for k in (sample, dimension, seed))]
+    v = [x * np.uint32(1664525) + np.uint32(1013904223) for x in v]
+    for shift in (16, None):
+        for k, (a, b) in enumerate(((1, 3), (2, 0), (0, 1), (1, 2))):
+            v[k] = v[k] + v[a] * v[b]
+        v = v if shift is None else [x ^ (x >> np.uint32(shift)) for x in v]
+    return torch.from_numpy(np.stack([(x >> np.uint32(8)) * 2.0**-24 for x in v[:2]], -1).astype(np.float32))
 
 
 def fraction_within(got: Tensor, expected: Tensor, relative: float = 1e-4) -> float:
