@@ -58,15 +58,3 @@ def mirror(wm: wp.vec3) -> wp.vec3:
 def reflect(wo: wp.vec3, wm: wp.vec3) -> wp.vec3:
     """``wo`` reflected about the microfacet normal ``wm``."""
     return wm * (2.0 * wp.dot(wo, wm)) - wo
-
-
-@wp.kernel
-def sample_cosine_kernel(
-    start: int,
-    # in
-    u: wp.array[wp.vec2],
-    # out
-    wi: wp.array[wp.vec3],
-):
-    i = start + wp.tid()
-    wi[i] = sample_cosine(u[i])

@@ -9,21 +9,18 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import call, check, empty, launch
+from reli3d._bridge import call, check
 from reli3d.kernels import microfacet
-from reli3d.kernels import sampling as kernels
 
 
 def sample_cosine(u: Tensor) -> Tensor:
     """Cosine-weighted directions ``(..., 3)`` for ``u (..., 2)``; density: :func:`pdf_cosine`.  No gradient."""
     check("u", u, last=2)
-    flat = u.detach().reshape(-1, 2).contiguous()
-    out = empty((flat.shape[0],), wp.vec3, u.device)
-    launch(kernels.sample_cosine_kernel, flat.shape[0], [flat, out], u.device)
-    return out.reshape(*u.shape[:-1], 3)
+    square, angle = u.detach()[..., 0], 2.0 * torch.pi * u.detach()[..., 1]
+    radius = square.sqrt()
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), (1.0 - square).sqrt()], -1)
 
 
 def pdf_cosine(wi: Tensor) -> Tensor:
