@@ -68,12 +68,10 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     """Masks by name of the views in ``masks``, which may lack parts of the object; unchanged without a support plane.
 
     The log odds of a pixel, object over background, compare a mixture of Gaussians of the object's colors with the
-    plane's texture, or elsewhere with the colors around the object.  Of each cell of a volume they give the log odds
-    that it is occupied (Franco and Boyer 2005): one view that sees the background through a cell empties it, and all
-    have to agree on an occupied one.  From the second pass on the texture is that of all views in which no cell above
-    SHADOW_HEIGHT covers it: a contact shadow, which the first masks include, becomes a part of the texture.  The
-    volume's silhouettes are added to the log odds of the pixels, and GrabCut starts there.  The last pass has larger
-    images, so that texture and evidence resolve the outline.
+    plane's texture, or elsewhere with the colors around the object.  They give the log odds that a cell of a volume is
+    occupied (Franco and Boyer 2005), on which all views have to agree.  From the second pass on, cells below
+    SHADOW_HEIGHT do not hide the plane, so that a contact shadow becomes a part of its texture.  GrabCut starts from
+    the log odds of the pixels and the volume's silhouettes.  The last pass has larger images.
     """
     if scene.plane is None:
         return masks
@@ -213,7 +211,7 @@ class _Colors:
         found = np.full(len(flat), LOWEST_DENSITY, np.float32)
         for middle, inverse, constant in self.parts:
             away = flat - middle
-            found = np.logaddexp(found, constant - 0.5 * ((away @ inverse) * away).sum(1))
+            found = np.logaddexp(found, constant - 0.5 * np.einsum("nk,nk->n", away @ inverse, away))
         return found.reshape(image.shape[:2])
 
 
@@ -262,12 +260,16 @@ def _occupied(smalls, evidence, axes: _Axes, box, points, cells: int, growth: fl
     grid = np.stack(np.meshgrid(at, at, at, indexing="ij"), -1) + middle
     flat = grid.reshape(-1, 3) @ axes.axes + axes.origin
     odds, seen = np.zeros(len(flat)), np.zeros(len(flat))
-    for small, e in zip(smalls, evidence, strict=True):
-        pixels, depth = small.project(flat)
+    open_cells = (grid[..., 2].ravel() > 0).nonzero()[0]
+    for k, (small, e) in enumerate(zip(smalls, evidence, strict=True), 1):
+        pixels, depth = small.project(flat[open_cells])
         x, y, shown = _shown(pixels, depth, e.shape)
-        odds[shown] -= np.log(COVERED + (1 - COVERED) * np.exp(-e[y, x]))
-        seen += shown
-    full = (odds > 0) & (seen >= LEAST_SEEN * len(smalls)) & (grid[..., 2].ravel() > 0)
+        odds[open_cells[shown]] -= np.log(COVERED + (1 - COVERED) * np.exp(-e[y, x]))
+        seen[open_cells] += shown
+        most_added = -np.log(COVERED) * (len(smalls) - k)  # by the views to come
+        open_cells = open_cells[odds[open_cells] + most_added > 0]
+    full = np.zeros(len(flat), bool)
+    full[open_cells] = seen[open_cells] >= LEAST_SEEN * len(smalls)
     label, count = ndimage.label(full.reshape(grid.shape[:3]))
     if count == 0:
         return np.zeros((0, 3)), cell
