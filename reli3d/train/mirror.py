@@ -33,10 +33,10 @@ def surface_mirror(position: np.ndarray) -> Plane | None:
     fine = [(float(a), float(o)) for a in coarse + np.linspace(-step, step, FINE) for o in OFFSETS]
     angle, shift = min(fine, key=lambda p: distances(p[0], p[1], SEARCH_POINTS).mean())
     found = distances(angle, shift, CHECK_POINTS)
-    apart = tree.query(position[:CHECK_POINTS], k=2)[0][:, 1]
-    if found.mean() > MAX_MEAN * apart.mean():
+    spacing = tree.query(position[:CHECK_POINTS], k=2)[0][:, 1]
+    if found.mean() > MAX_MEAN * spacing.mean():
         return None
-    if np.quantile(found, QUANTILE) > MAX_QUANTILE * np.quantile(apart, QUANTILE):
+    if np.quantile(found, QUANTILE) > MAX_QUANTILE * np.quantile(spacing, QUANTILE):
         return None
     return plane(angle, shift)
 
