@@ -8,8 +8,6 @@ Outputs must be disjoint per ``i``, because Warp's CPU atomics are not atomic.  
 several ``i`` read (listed in ``shared``) has one accumulator per slice; they are summed in the order of the slices.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os

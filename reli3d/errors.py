@@ -1,7 +1,5 @@
 """The error that every layer raises for input that the user can correct."""
 
-from __future__ import annotations
-
 
 class InputError(ValueError):
     """Input that cannot be used.  The text is one line: the file or option, the field, the value and the fix.

@@ -6,8 +6,6 @@ one with known ground truth, and ValueError and OSError of one line.  Failing in
 same inputs.  Runs on Linux.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import ctypes

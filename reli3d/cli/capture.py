@@ -1,7 +1,5 @@
 """``reli3d capture``: photographs or a video without cameras to an object folder."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """``reli3d check``: checks the cameras and masks of object folders, without a reconstruction."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -33,7 +31,7 @@ def parser() -> Parser:
 class Check:
     """Checks the cameras of objects: a :class:`~reli3d.cli.objects.Job`.  found: results by the name of the object."""
 
-    reading: FolderOptions
+    reading: "FolderOptions"
     silent: bool
     found: dict[str, dict] = field(default_factory=dict)
 

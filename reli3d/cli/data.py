@@ -1,7 +1,5 @@
 """``reli3d-data``: renders training samples of procedural objects or meshes, and packs objects into shards."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import functools

@@ -1,7 +1,5 @@
 """``reli3d doctor``: reports versions, devices, kernel cache and weights, and whether the package is usable."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

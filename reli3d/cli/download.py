@@ -1,7 +1,5 @@
 """``reli3d download``: fetches and converts the published ReLi3D network."""
 
-from __future__ import annotations
-
 from reli3d.cli.exit_codes import Parser, command
 
 

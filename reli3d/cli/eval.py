@@ -1,7 +1,5 @@
 """``reli3d-eval``: metrics of the network on held-out procedural objects."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

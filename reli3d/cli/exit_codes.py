@@ -5,8 +5,6 @@ whose traceback goes to a log file and, with ``--traceback``, to stderr.  130, 1
 removing partially written files.  Closed or full output streams and unencodable characters do not change the code.
 """
 
-from __future__ import annotations
-
 import argparse
 import atexit
 import contextlib

@@ -1,7 +1,5 @@
 """``reli3d export``: converts a GLB to another format, with fewer triangles or smaller textures."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

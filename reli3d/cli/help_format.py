@@ -1,7 +1,5 @@
 """Formatting of ``--help`` and preprocessing of arguments."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

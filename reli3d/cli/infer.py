@@ -1,7 +1,5 @@
 """``reli3d-infer``: posed photographs to a relightable asset."""
 
-from __future__ import annotations
-
 import argparse
 import functools
 import json

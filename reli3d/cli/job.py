@@ -1,7 +1,5 @@
 """The job of ``reli3d-infer`` for each object, with a progress bar on stderr."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import signal
@@ -106,7 +104,7 @@ class Bar(Progress):
         for note in notes:
             self.bar.write(f"{self.name}: {printable(note)}", file=sys.stderr)
 
-    def __enter__(self) -> Bar:
+    def __enter__(self) -> "Bar":
         return self
 
     def __exit__(self, kind, error, trace) -> None:

@@ -1,7 +1,5 @@
 """``reli3d``: the entry point of all commands."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import sys

@@ -4,8 +4,6 @@ An object whose worker crashed is retried once, in worker processes while nothin
 single-threaded; results are bitwise identical for any number of workers.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import functools

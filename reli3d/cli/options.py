@@ -1,7 +1,5 @@
 """The options of ``reli3d-infer``, and those in common with ``reli3d check``."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``reli3d-render``: still images and turntables of a GLB under an environment map."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """The job of ``reli3d-data render``: one sample per call."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -64,7 +62,7 @@ class SampleJob:
             raise OSError(f"{target}: cannot be written ({error})") from None
         return "done"
 
-    def _surface(self, seed: int, rng: np.random.Generator) -> Surface:
+    def _surface(self, seed: int, rng: "np.random.Generator") -> "Surface":
         """The object of a seed.  rng: stretches and tints meshes, except with the paper's protocol."""
         from reli3d.synthetic.procedural import make_object
         from reli3d.synthetic.refinished import RefinishedSurface
@@ -92,7 +90,7 @@ class SampleJob:
     def _mesh(self, seed: int) -> Path:
         return self.spec.meshes[seed % len(self.spec.meshes)]
 
-    def _own(self, seed: int) -> dict[str, Tensor]:
+    def _own(self, seed: int) -> "dict[str, Tensor]":
         import numpy as np
 
         from reli3d.synthetic.maps import with_lamps
@@ -109,7 +107,7 @@ class SampleJob:
             surface, light, rng, size=spec.size, views=spec.views, views_only=spec.views_only, finish_known=known
         )
 
-    def _paper(self, seed: int, light: int) -> dict[str, Tensor]:
+    def _paper(self, seed: int, light: int) -> "dict[str, Tensor]":
         import numpy as np
 
         from reli3d.synthetic.protocol import protocol_sample

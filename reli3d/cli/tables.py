@@ -1,7 +1,5 @@
 """``reli3d-tables``: the tables of the ReLi3D paper on a folder of textured GLB files."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``reli3d-train``: trains one stage of a network."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import math
@@ -129,7 +127,7 @@ def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     return {name: getattr(args, name) for name in names if name in args}
 
 
-def small_stage(args: argparse.Namespace) -> Stage:
+def small_stage(args: argparse.Namespace) -> "Stage":
     """A stage of the small network."""
     from reli3d.nn.presets import CALIBRATED_VIEWS
     from reli3d.nn.value_bins import with_bins
@@ -172,7 +170,7 @@ def device_of(args: argparse.Namespace) -> str:
     return device
 
 
-def small_network(start: str | None, resumed: Path) -> LocalReconstructor:
+def small_network(start: str | None, resumed: Path) -> "LocalReconstructor":
     """The small network with the weights of ``start``, or with random ones.  A checkpoint may lack the finer levels.
 
     resumed: the checkpoint that the run continues from if it exists; without ``start`` its preset is used.
@@ -197,7 +195,7 @@ def small_network(start: str | None, resumed: Path) -> LocalReconstructor:
     return found.train().requires_grad_(True)
 
 
-def light_prior_stage(args: argparse.Namespace) -> Stage:
+def light_prior_stage(args: argparse.Namespace) -> "Stage":
     """Training of the environment decoder alone."""
     from reli3d.nn.presets import OFFICIAL, TINY
     from reli3d.train.light_prior import LightPriorStage
@@ -208,7 +206,7 @@ def light_prior_stage(args: argparse.Namespace) -> Stage:
     return LightPriorStage(preset, args.data[0], **given(args, "seed"))
 
 
-def paper_stage(args: argparse.Namespace) -> Stage:
+def paper_stage(args: argparse.Namespace) -> "Stage":
     """A stage of the paper's network."""
 
     from reli3d.nn.model import Reconstructor
@@ -253,7 +251,7 @@ def paper_stage(args: argparse.Namespace) -> Stage:
     )
 
 
-def start_from(start: str, model: Reconstructor) -> None:
+def start_from(start: str, model: "Reconstructor") -> None:
     """Loads the averaged weights of a checkpoint or a weights file into ``model``.  Raises InputError."""
     from reli3d.nn import weights
     from reli3d.train import checkpoint
@@ -269,7 +267,7 @@ def start_from(start: str, model: Reconstructor) -> None:
     model.load_state_dict(average)
 
 
-def export(args: argparse.Namespace, stage: Stage) -> LocalReconstructor | Reconstructor:
+def export(args: argparse.Namespace, stage: "Stage") -> "LocalReconstructor | Reconstructor":
     """The network with the averaged weights of the checkpoint, the small network calibrated.
 
     Raises InputError if it predicts no surface.

@@ -1,7 +1,5 @@
 """``reli3d view``: serves the viewer page of a reconstruction on this machine and opens it in the browser."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import functools

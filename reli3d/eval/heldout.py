@@ -4,8 +4,6 @@ For every sample: silhouette IoU and base color PSNR in held-out views, with the
 baseline; and the error of the environment, with that of the mean training environment as a baseline.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Geometry is compared in the frame of the reference, scaled so that its longest s
 display values (sRGB in [0, 1]) over black, including the background.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 import trimesh

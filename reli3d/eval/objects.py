@@ -6,8 +6,6 @@ An object is centered and scaled to a longest side of 1.  The input views are li
 compare renderings under the input lighting, relighting by another environment, and the material maps.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ Maps are ``(T, T, C)``; row 0 is v = 0 (glTF: v down).  Texel (row, column) is s
 T, (row + 0.5) / T).  No gradients.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import overload

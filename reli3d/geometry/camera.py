@@ -10,8 +10,6 @@ depth         distance along the viewing axis (-Z of the camera), not along the 
 Other conventions are converted in ``reli3d.views`` and ``reli3d.io`` and nowhere else.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -57,7 +55,7 @@ class Camera:
             raise ValueError(f"width, height: expected at least 1, got {self.width}, {self.height}")
 
     @classmethod
-    def from_fov(cls, c2w: Tensor, fov_x: float, width: int, height: int) -> Camera:
+    def from_fov(cls, c2w: Tensor, fov_x: float, width: int, height: int) -> "Camera":
         """Camera with square pixels and the principal point at the image center.
 
         c2w: ``(..., 4, 4)`` float32 camera-to-world, such as from :func:`look_at`.  fov_x: full horizontal field of
@@ -73,15 +71,15 @@ class Camera:
         row = torch.tensor([f, f, 0.5 * width, 0.5 * height], dtype=torch.float32, device=c2w.device)
         return cls(c2w, row.expand(*c2w.shape[:-2], 4).contiguous(), width, height)
 
-    def to(self, device: torch.device | str) -> Camera:
+    def to(self, device: torch.device | str) -> "Camera":
         """The same camera on ``device``."""
         return Camera(self.c2w.to(device), self.intrinsics.to(device), self.width, self.height)
 
-    def detach(self) -> Camera:
+    def detach(self) -> "Camera":
         """The same camera without gradient."""
         return Camera(self.c2w.detach(), self.intrinsics.detach(), self.width, self.height)
 
-    def __getitem__(self, index) -> Camera:
+    def __getitem__(self, index) -> "Camera":
         """The cameras that ``index`` picks from the batch axes, as torch indexes."""
         return Camera(self.c2w[index], self.intrinsics[index], self.width, self.height)
 
@@ -90,13 +88,13 @@ class Camera:
         """Camera position, ``(..., 3)``."""
         return self.c2w[..., :3, 3]
 
-    def resized(self, width: int, height: int) -> Camera:
+    def resized(self, width: int, height: int) -> "Camera":
         """The same view in ``width`` x ``height`` pixels; gradients reach the intrinsics."""
         x, y = width / self.width, height / self.height
         scale = x if x == y else self.intrinsics.new_tensor([x, y, x, y])  # a number waits for no device
         return Camera(self.c2w, self.intrinsics * scale, width, height)
 
-    def scaled(self, factor: int) -> Camera:
+    def scaled(self, factor: int) -> "Camera":
         """The same view with ``factor`` times as many pixels along each side."""
         if factor < 1:
             raise ValueError(f"factor: expected at least 1, got {factor}")

@@ -6,8 +6,6 @@ more than two, is a border.  Every step takes a sort or less, so the time is bou
 overlaps.  All runs on the CPU, in numpy but for the kernels' steps.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Silhouette coverage: lowers a signed field along rays inside the silhouettes that miss the surface."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d

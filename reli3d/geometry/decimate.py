@@ -3,8 +3,6 @@
 ``manifold3d`` can decimate too, but it takes a tolerance instead of a face count, and accepts solids only.
 """
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Signed distance to closed meshes, the ground truth for volume points in training."""
 
-from __future__ import annotations
-
 import torch
 import warp as wp
 from torch import Tensor

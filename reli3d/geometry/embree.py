@@ -5,8 +5,6 @@ traces rays in it by the addresses of Embree's functions.  Names and constants: 
 https://github.com/RenderKit/embree.
 """
 
-from __future__ import annotations
-
 import ctypes
 import weakref
 from functools import lru_cache

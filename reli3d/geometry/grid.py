@@ -1,7 +1,5 @@
 """Regular grids: trilinear interpolation and the weighted squared Laplacian."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

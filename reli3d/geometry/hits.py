@@ -3,8 +3,6 @@
 The choice of the hit face has no gradient; everything evaluated at the hit has gradients.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -4,8 +4,6 @@ Faces are counter-clockwise seen from outside.  Topology (components, report) re
 vertices at bit-identical positions are merged, because atlases and exporters split the vertices of a connected surface.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
@@ -51,23 +49,23 @@ class Mesh:
             if value is not None:
                 check(name, value, shape=(len(self.vertices), last), like=self.vertices)
 
-    def to(self, device: torch.device | str) -> Mesh:
+    def to(self, device: torch.device | str) -> "Mesh":
         """The same mesh on another device."""
         return self._changed(lambda value: value.to(device))
 
-    def detach(self) -> Mesh:
+    def detach(self) -> "Mesh":
         """The same mesh without gradients."""
         return self._changed(lambda value: value.detach())
 
-    def _changed(self, change: Callable[[Tensor], Tensor]) -> Mesh:
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> "Mesh":
         present = {f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None}
         return Mesh(**{name: change(value) for name, value in present.items()})
 
-    def with_normals(self) -> Mesh:
+    def with_normals(self) -> "Mesh":
         """The same mesh with :func:`vertex_normals`."""
         return replace(self, normals=vertex_normals(self.vertices, self.faces))
 
-    def with_tangents(self) -> Mesh:
+    def with_tangents(self) -> "Mesh":
         """The same mesh with :func:`~reli3d.geometry.tangents.vertex_tangents`.  ValueError without normals or UV."""
         if self.normals is None:
             raise ValueError("mesh.normals: expected a tensor, got None (see Mesh.with_normals)")

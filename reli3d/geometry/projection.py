@@ -1,7 +1,5 @@
 """Values of posed images at points in space."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from reli3d._bridge import call, check

@@ -5,8 +5,6 @@ misses if it hits nothing, if it contains a NaN, an infinity or a zero direction
 float32.  A miss has ``face = -1``, ``t = inf``, ``bary = 0``.  Only :meth:`RayScene.intersect` has gradients.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 import warp as wp

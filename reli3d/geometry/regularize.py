@@ -3,8 +3,6 @@
 Both are plain torch operations on the surface cubes only; gradients reach every input, in float32 as in the extraction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

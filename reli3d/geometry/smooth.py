@@ -4,8 +4,6 @@ Neighbors are taken from the welded mesh, so that surfaces do not tear at UV sea
 are kept; normals and tangents are dropped because they no longer match the positions.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sparse evaluation of a signed field on a grid, only where the surface may be."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

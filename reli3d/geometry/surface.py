@@ -7,8 +7,6 @@ code.  After one pass over the grid the cost is proportional to the number of su
 tetrahedra of the paper's section 4.5, and dual vertices placed by the field's gradient.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache

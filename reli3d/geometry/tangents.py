@@ -5,8 +5,6 @@ points along -v, up in the image; w is +1 where the texture is not mirrored.  A 
 along the tangent and green along the bitangent.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

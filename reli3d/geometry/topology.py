@@ -4,8 +4,6 @@ Half-edge ``3 * face + corner`` runs from that corner to the next one of its fac
 same two vertices, in either direction.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

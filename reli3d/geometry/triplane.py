@@ -1,7 +1,5 @@
 """Features of points from a triplane: three feature planes over XY, XZ and YZ of the cube [-1, 1]^3."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -5,8 +5,6 @@ counter-clockwise.  The atlas is computed on the CPU, and ``uv`` has no gradient
 gathered from the input, and gradients pass through.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Visibility of surface points in posed cameras."""
 
-from __future__ import annotations
-
 import torch
 import warp as wp
 from torch import Tensor

@@ -4,8 +4,6 @@ Supported: one flat part of scanlines or single-level tiles, with channels R, G,
 multi-level and luminance-chroma files are errors.  Source: https://openexr.com/en/latest/TechnicalIntroduction.html.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 

@@ -1,7 +1,5 @@
 """Reading and writing files safely: one-line errors, size limits, whole files or none."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import stat

@@ -4,8 +4,6 @@ Axes and units are as in glTF (+Y up, right-handed), so nothing is rotated.  Bas
 metallic are the green and blue channel of a linear texture.  All factors are 1.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os

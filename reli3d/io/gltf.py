@@ -5,8 +5,6 @@ InputError that names the field; every omission is a note.  Primitives are read 
 ``gltf_materials.py``.  Source: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import json

@@ -1,7 +1,5 @@
 """Reads GLB materials as texture sets; see ``gltf.py`` for the container."""
 
-from __future__ import annotations
-
 import io
 import math
 import warnings

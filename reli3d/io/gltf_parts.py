@@ -1,7 +1,5 @@
 """Reads GLB primitives, at rest, as assets; see ``gltf.py`` for the container."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 

@@ -7,8 +7,6 @@ Writing raises an error for NaN and negative values; infinity and, in half preci
 65504.  Reading raises an error for NaN, sets negative values to 0 and infinity to 65504.
 """
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

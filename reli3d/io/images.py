@@ -5,8 +5,6 @@ orientation is reported in a note but not applied, because calibrated cameras re
 image size in the camera file fits only the rotated image.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import warnings

@@ -5,8 +5,6 @@ The keywords ``map_Pr``, ``map_Pm`` and ``norm`` are from the PBR extension
 dielectric of refractive index 1.5; without it, Blender shows no specular reflection.
 """
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

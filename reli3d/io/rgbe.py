@@ -4,8 +4,6 @@ A pixel is three mantissas and a common exponent: value = mantissa / 256 * 2 ** 
 Real Pixels, Graphics Gems II (1991); Radiance's "File Formats" (https://radsite.lbl.gov/radiance/refer/filefmts.pdf).
 """
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

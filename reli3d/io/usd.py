@@ -1,7 +1,5 @@
 """Writes USDZ with Pixar's USD library (``usd-core``), an optional dependency: one mesh with a UsdPreviewSurface."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Evaluation of large point sets in blocks that fit the cache, and tasks on the thread pool."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar
 

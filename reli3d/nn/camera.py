@@ -4,8 +4,6 @@ Camera-to-world matrices are 4x4 in OpenGL axes (+X right, +Y up, looking along 
 pixels of the square input, pixel centers at +0.5.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -4,8 +4,6 @@
 the volume and the pixel maps of the convolutional one.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass

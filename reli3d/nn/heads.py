@@ -3,8 +3,6 @@
 Sizes are the published ones; :mod:`reli3d.nn.published` maps the published names to these.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@
 ``HF_ENDPOINT``, ``HF_TOKEN``, ``HF_HUB_OFFLINE`` and the proxies of the environment.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import re

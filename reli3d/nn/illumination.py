@@ -4,8 +4,6 @@ The views are tokenized a second time together with their masks, so that masked 
 learned tokens attends to them and to the triplane.  Parameter names are the published checkpoint's.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

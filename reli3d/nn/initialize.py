@@ -1,7 +1,5 @@
 """Parameters for training from scratch."""
 
-from __future__ import annotations
-
 import math
 
 from torch import nn

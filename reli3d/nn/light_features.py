@@ -5,8 +5,6 @@ The second is a least-squares fit: over many points the base color averages out 
 and Hanrahan 2001: diffuse irradiance is well approximated by nine spherical harmonics).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -6,8 +6,6 @@ equivariant to rotation about +Y.  The network was trained on maps with -Z at th
 the result has the layout of :mod:`reli3d.render.latlong`.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional

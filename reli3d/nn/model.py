@@ -1,7 +1,5 @@
 """The network as one module: views in; a triplane that can be queried at points and an environment out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -34,7 +32,7 @@ class Code:
     rotation: Tensor  # (B, 3, 3) turns the latents
     strength: Tensor  # (B,) natural logarithm of the radiance factor
 
-    def of(self, b: int) -> Code:
+    def of(self, b: int) -> "Code":
         """Object ``b`` alone, as a batch of one."""
         return Code(*(getattr(self, field.name)[b : b + 1] for field in fields(self)))
 
@@ -71,7 +69,7 @@ class Reconstructor(nn.Module):
         """Of the trunk's parameters, in which it computes."""
         return self.bank.embeddings.dtype
 
-    def to_compute(self, dtype: torch.dtype) -> Reconstructor:
+    def to_compute(self, dtype: torch.dtype) -> "Reconstructor":
         """Cast the trunk (encoders, transformers, upsampler) to ``dtype``, in place; the rest stays float32."""
         for part in self.trunk():
             part.to(dtype)

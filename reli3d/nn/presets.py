@@ -6,8 +6,6 @@ its training runs on two cores and shows that the stages work.  ``small`` is the
 whose weights are in the package.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -5,8 +5,6 @@ modulation of every encoder layer a second time under ``modulations``: index 2i 
 second.
 """
 
-from __future__ import annotations
-
 import re
 
 CHECKPOINT_PREFIX = "system."  # of the training system, before every name below

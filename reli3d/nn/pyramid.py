@@ -4,8 +4,6 @@ Convolutions are local and translation-equivariant and so need far fewer trainin
 Ronneberger et al. 2015, U-Net, arXiv 1505.04597.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -8,8 +8,6 @@ The published maps have -Z at the horizontal center and +X right of it; :func:`f
 convert.  Maps of this package are those of :mod:`reli3d.render.latlong`.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

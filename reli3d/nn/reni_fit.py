@@ -1,7 +1,5 @@
 """RENI++ latents of a given map, by gradient descent through the frozen decoder."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

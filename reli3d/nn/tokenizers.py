@@ -5,8 +5,6 @@ Source: DINOv2 (Oquab et al. 2023, arXiv 2304.07193) for the encoder; adaptive l
 patches row by row, camera.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -4,8 +4,6 @@ Source: section 3 of the paper, in the form of its release: the tokens of the re
 all views enter by cross-attention, and the last blocks mix experts.  Parameter names are those of the checkpoint.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

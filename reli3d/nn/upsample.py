@@ -3,8 +3,6 @@
 Source: pixel shuffle, Shi et al. 2016, arXiv 1609.05158.  Parameter names are the published checkpoint's.
 """
 
-from __future__ import annotations
-
 from torch import Tensor, nn
 
 from reli3d.nn.presets import UpsamplerSizes

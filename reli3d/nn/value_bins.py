@@ -7,8 +7,6 @@ binomial distribution, whose expectation for logits ``k l`` is ``sigmoid(l)``: a
 exactly, by :func:`with_bins`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

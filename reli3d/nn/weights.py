@@ -4,8 +4,6 @@ A file of ours carries its preset, its license and what else the writer states i
 pickle checkpoint is only ever read by torch's restricted reader and turned into such a file.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

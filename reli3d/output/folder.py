@@ -6,8 +6,6 @@ files) and, during the exchange, ``old``.  A killed process leaves this sibling 
 RENAME_EXCHANGE).  Elsewhere two renames are needed; between them ``NAME`` is missing and ``new`` is complete.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import errno

@@ -1,7 +1,5 @@
 """Contact sheet of a reconstruction: input images, novel views, maps and environment."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import partial

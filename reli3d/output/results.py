@@ -1,7 +1,5 @@
 """Writes the files of one reconstruction atomically, by :mod:`reli3d.output.folder`."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence

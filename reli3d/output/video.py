@@ -1,7 +1,5 @@
 """Encodes MP4 video with PyAV (``av``), an optional dependency whose wheel includes FFmpeg's libraries."""
 
-from __future__ import annotations
-
 import importlib
 import io
 from types import ModuleType

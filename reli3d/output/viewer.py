@@ -1,7 +1,5 @@
 """A self-contained HTML page that shows a reconstruction in a browser, offline."""
 
-from __future__ import annotations
-
 import base64
 import html
 import io

@@ -1,7 +1,5 @@
 """Allocates samples to the strategies of direct lighting by variances estimated in a pilot run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -1,9 +1,8 @@
 """Assets: a mesh with textures and an environment."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -11,10 +10,6 @@ from torch import Tensor
 from reli3d._bridge import check, expect, present, tensor_of
 from reli3d.geometry.mesh import Mesh
 from reli3d.render.environment import Environment
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from typing import Any
 
 FLAT = (0.5, 0.5, 1.0)  # texel of a normal map without perturbation
 WRAPS = ("repeat", "mirror", "clamp")  # glTF's REPEAT, MIRRORED_REPEAT, CLAMP_TO_EDGE
@@ -101,15 +96,15 @@ class TextureSet:
             object.__setattr__(self, "_rough_metal", (written, values))
         return values
 
-    def to(self, device: torch.device | str) -> TextureSet:
+    def to(self, device: torch.device | str) -> "TextureSet":
         """The same maps on ``device``."""
         return self._changed(lambda value: value.to(device))
 
-    def detach(self) -> TextureSet:
+    def detach(self) -> "TextureSet":
         """The same maps without gradient."""
         return self._changed(lambda value: value.detach())
 
-    def _changed(self, change: Callable[[Tensor], Tensor]) -> TextureSet:
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> "TextureSet":
         maps: dict[str, Any] = {f.name: change(getattr(self, f.name)) for f in fields(self) if f.name != "wrap"}
         return replace(self, **maps)
 
@@ -138,15 +133,15 @@ class Asset:
             if name == "mesh" or getattr(self, name) is not None:
                 expect(name, getattr(self, name), kind)
 
-    def to(self, device: torch.device | str) -> Asset:
+    def to(self, device: torch.device | str) -> "Asset":
         """The same asset on ``device``."""
         return self._changed(lambda part: part.to(device))
 
-    def detach(self) -> Asset:
+    def detach(self) -> "Asset":
         """The same asset without gradient."""
         return self._changed(lambda part: part.detach())
 
-    def _changed(self, change: Callable[[Any], Any]) -> Asset:
+    def _changed(self, change: Callable[[Any], Any]) -> "Asset":
         textures = self.textures and change(self.textures)  # a renderer takes an asset without textures too
         return Asset(change(self.mesh), textures, self.environment and change(self.environment))
 

@@ -1,7 +1,5 @@
 """Shading normals from tangent-space bump normals, in the frame of ReLi3D."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.linalg import cross

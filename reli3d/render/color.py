@@ -1,7 +1,5 @@
 """Color transforms: sRGB encoding and decoding, and the AgX display transform.  Linear values are Rec. 709."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

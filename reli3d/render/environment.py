@@ -3,8 +3,6 @@
 Mapping as in :mod:`reli3d.render.latlong`: upper edge +Y, horizontal center +X, +Z right of the center.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -71,16 +69,16 @@ class Environment:
             raise ValueError(f"radiance: expected (H, W, 3), got {tuple(self.radiance.shape)}")
 
     @classmethod
-    def constant(cls, rgb: Tensor, height: int = 16) -> Environment:
+    def constant(cls, rgb: Tensor, height: int = 16) -> "Environment":
         """Uniform lighting with radiance ``rgb (3,)``."""
         check("rgb", rgb, last=3)
         return cls(rgb.expand(height, 2 * height, 3).contiguous())
 
-    def to(self, device: torch.device | str) -> Environment:
+    def to(self, device: torch.device | str) -> "Environment":
         """The environment on ``device``; ``self``, with its CDF, if it is already there."""
         return self if indexed(torch.device(device)) == self.radiance.device else Environment(self.radiance.to(device))
 
-    def detach(self) -> Environment:
+    def detach(self) -> "Environment":
         """The environment without gradient."""
         return Environment(self.radiance.detach())
 
@@ -94,7 +92,7 @@ class Environment:
         return _Lookup.apply(self.radiance.contiguous(), flat).reshape(directions.shape)
 
     @full_precision
-    def irradiance(self) -> Environment:
+    def irradiance(self) -> "Environment":
         """Irradiance [radiance times sr] for every surface normal, as a lat-long map of the same size.
 
         Sums all n texels, weighted by cosine and solid angle, for each normal: n^2 terms, so use maps of at most 32
@@ -106,7 +104,7 @@ class Environment:
         weight = ((directions @ directions.T).clamp(min=0.0) * angle).to(self.radiance)
         return Environment((weight @ self.radiance.reshape(-1, 3)).reshape(self.radiance.shape))
 
-    def rotated(self, yaw: float) -> Environment:
+    def rotated(self, yaw: float) -> "Environment":
         """The environment rotated by ``yaw`` [rad] about +Y, counter-clockwise seen from above: -Z moves towards -X.
 
         yaw: a Python number, without gradient.  Columns are interpolated linearly; multiples of 2 pi / W shift exactly.
@@ -123,7 +121,7 @@ class Environment:
             radiance = (1.0 - part) * radiance + part * torch.roll(radiance, -1, 1)
         return Environment(radiance)
 
-    def resized(self, height: int) -> Environment:
+    def resized(self, height: int) -> "Environment":
         """The environment at ``height`` x 2 ``height`` texels: area-averaged when reduced, bilinear when enlarged."""
         planes = self.radiance.permute(2, 0, 1)[None]
         mode = "area" if height <= self.radiance.shape[0] else "bilinear"

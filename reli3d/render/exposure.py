@@ -5,8 +5,6 @@ observed colors under a lighting prior, and the network's prediction.  The light
 images have the same mean color.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

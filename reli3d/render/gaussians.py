@@ -5,8 +5,6 @@ nor Monte Carlo noise: for the early stages of an optimization, it is a smooth f
 material.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Primary visibility: camera-ray hits, and textures and materials at hits, with gradients."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize

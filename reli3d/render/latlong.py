@@ -6,8 +6,6 @@ direction is (cos phi sin theta, cos theta, sin phi sin theta).  Texel centers a
 1/2) / H.  ``reli3d.kernels.envmap`` implements the same mapping for kernels.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -3,8 +3,6 @@
 Both have mean radiance 1 over the sphere, so the radiance of a diffuse surface approximately equals its albedo.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

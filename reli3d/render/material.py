@@ -4,8 +4,6 @@ Argument order: ``wo``, the material, then ``wi`` (to evaluate) or ``u`` (to sam
 width, ``roughness**2``.  The formulas are in ``reli3d.kernels.bsdf``.
 """
 
-from __future__ import annotations
-
 import torch
 import warp as wp
 from torch import Tensor

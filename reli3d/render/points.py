@@ -1,7 +1,5 @@
 """Surface points with their material."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from numbers import Real
@@ -58,15 +56,15 @@ class SurfacePoints:
     def __len__(self) -> int:
         return len(self.position)
 
-    def __getitem__(self, rows: Tensor | slice) -> SurfacePoints:
+    def __getitem__(self, rows: Tensor | slice) -> "SurfacePoints":
         """The points of ``rows``: a slice, indices or a mask."""
         return SurfacePoints(*(getattr(self, f.name)[rows] for f in fields(self)))
 
-    def detach(self) -> SurfacePoints:
+    def detach(self) -> "SurfacePoints":
         """The same points without gradient."""
         return SurfacePoints(*(getattr(self, f.name).detach() for f in fields(self)))
 
-    def to(self, device: torch.device | str) -> SurfacePoints:
+    def to(self, device: torch.device | str) -> "SurfacePoints":
         """The same points on ``device``."""
         return SurfacePoints(*(getattr(self, f.name).to(device) for f in fields(self)))
 

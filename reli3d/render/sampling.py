@@ -3,8 +3,6 @@
 Samplers take ``u``, uniform in [0, 1)^2.  Leading axes broadcast; tensors are float32 on one device.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

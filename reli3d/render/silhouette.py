@@ -10,8 +10,6 @@ The sum over an antialiased mask has the exact derivative of the covered area.  
 have a relative error of about 10 %.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

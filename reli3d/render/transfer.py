@@ -5,8 +5,6 @@ Environments".  The harmonics are real, orthonormal, up to degree 3, with polar 
 about +Y rotates its coefficients in pairs.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -5,8 +5,6 @@ al. 2023), empty cells of the grid need no field queries.  The caller queries th
 composite.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -35,7 +33,7 @@ class OccupancyGrid:
             raise ValueError(f"radius: expected a positive number, got {self.radius}")
 
     @classmethod
-    def full(cls, resolution: int, radius: float, device: torch.device | None = None) -> OccupancyGrid:
+    def full(cls, resolution: int, radius: float, device: torch.device | None = None) -> "OccupancyGrid":
         """Grid with every cell occupied."""
         return cls(torch.ones(resolution, resolution, resolution, dtype=torch.bool, device=device), radius)
 
@@ -48,7 +46,7 @@ class OccupancyGrid:
         *,
         threshold: float,
         device: torch.device | None = None,
-    ) -> OccupancyGrid:
+    ) -> "OccupancyGrid":
         """Cells where ``field`` exceeds ``threshold`` at the center or a corner, grown by one cell on every side.
 
         field: maps points ``(N, 3)`` to densities ``(N,)``; evaluated without gradient, in chunks.  Detail smaller than

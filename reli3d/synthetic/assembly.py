@@ -1,7 +1,5 @@
 """Constructive solid geometry of procedural objects: solids with part numbers, their union, cuts and deformations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Palettes follow everyday objects: mostly grays, browns, whites and dark plastics
 linear Rec. 709.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 Lengths are in meters, approximately; the floor is at y = 0 and the front faces +z.  ``manmade.py`` defines a family.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from reli3d.synthetic import primitives as p

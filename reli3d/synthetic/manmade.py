@@ -4,8 +4,6 @@ A family is a function ``family(assembly)`` that draws from ``assembly.rng`` and
 order of 1.  Proportions are typical: legs a few percent of the height, walls 2 to 6 %, edges rounded by 0 to 10 %.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from manifold3d import CrossSection, Manifold
 

@@ -1,7 +1,5 @@
 """Environment maps: the split into training and held-out maps, and added lamps."""
 
-from __future__ import annotations
-
 import zipfile
 import zlib
 from pathlib import Path

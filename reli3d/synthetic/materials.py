@@ -3,8 +3,6 @@
 Base colors are linear Rec. 709, 0.02 to 0.9; roughness is perceptual.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol

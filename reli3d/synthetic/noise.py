@@ -1,7 +1,5 @@
 """Solid noise with gradients: fractal sums of gradient noise, and cellular noise."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

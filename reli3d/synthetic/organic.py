@@ -4,8 +4,6 @@ Each is a signed field on a grid, negative inside, whose zero iso-surface is ext
 one vertex per cell that the surface crosses, at the mean of its edge crossings, and one quad per crossed grid edge.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

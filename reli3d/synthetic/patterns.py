@@ -5,8 +5,6 @@
 pattern units: rotation, stretch and frequency.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Every function returns a closed manifold3d solid.  Rounded boxes are convex hull
 tubes are swept with rotation-minimizing frames.  ``segments``: number of sides of a full circle.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

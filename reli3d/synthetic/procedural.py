@@ -4,8 +4,6 @@ The same seed gives the same object.  ``TRAINING_SEEDS``, ``VALIDATION_SEEDS`` a
 right-handed, +Y up, centered, longest side 1, inside the sphere of radius 0.87 of the network's frame.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ Not given in the paper: here the views of an object are divided among its enviro
 at three standard deviations, and cameras are uniform over a zone of the sphere.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

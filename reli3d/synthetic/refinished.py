@@ -5,8 +5,6 @@ base color with another roughness and metallic value, a scanned material set by 
 material.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path

@@ -5,8 +5,6 @@ with shapes and units.  It has ``V`` views of ``S`` by ``S`` pixels, cropped to 
 centered, longest side 1.  Radiance is scaled by the exposure of the first view.
 """
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np

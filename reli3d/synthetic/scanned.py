@@ -1,7 +1,5 @@
 """Textured meshes, such as scans, as training objects."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Untextured GLB files as training objects: smoothed, stretched and combined, with procedural materials."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path

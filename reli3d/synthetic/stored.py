@@ -1,7 +1,5 @@
 """Validation of training samples by their file headers."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

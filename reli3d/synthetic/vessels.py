@@ -1,7 +1,5 @@
 """Families of vessels, lamps and containers.  ``manmade.py`` defines a family."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from reli3d.synthetic import primitives as p

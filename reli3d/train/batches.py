@@ -1,7 +1,5 @@
 """Training examples of the small network: views, points and maps from :mod:`reli3d.synthetic.samples`, augmented."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -64,7 +62,7 @@ class TrainingViews:
     view_valid: Tensor  # (V, P, P) bool: the surface covers the whole pixel
     finish_known: Tensor  # (V,) bool: roughness and metallic are ground truth, not placeholders
 
-    def of_views(self, chosen: slice | Tensor) -> TrainingViews:
+    def of_views(self, chosen: slice | Tensor) -> "TrainingViews":
         """The views of the indices ``chosen``."""
         return TrainingViews(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
 

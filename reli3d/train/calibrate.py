@@ -4,8 +4,6 @@ An uncertain network predicts occupancies below 0.5 at the true surface, which m
 to the logit compensates.  Uncertainty depends on the number of views, so one and four views have separate constants.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

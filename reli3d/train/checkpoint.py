@@ -1,7 +1,5 @@
 """Checkpoints of a training run: one file with all that is needed to resume, the same for every stage."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

@@ -5,8 +5,6 @@ maps with a relative rotation and a tint augment a small collection.  Maps are s
 exposure is a separate output of the network.  Source: Gardner et al. 2023, RENI++, arXiv 2311.09361, section 4.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The log of a training run, plots of it (drawn with Pillow), and TensorBoard event files."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping

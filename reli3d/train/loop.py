@@ -5,8 +5,6 @@ validation images.  A run resumes from its last checkpoint; on a CPU the result 
 uninterrupted run.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import time

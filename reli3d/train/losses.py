@@ -1,7 +1,5 @@
 """Losses of :class:`~reli3d.nn.local.LocalReconstructor` for one object."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn import functional

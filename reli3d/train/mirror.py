@@ -1,7 +1,5 @@
 """Mirror plane of a sampled surface: half of all scans have one, and inference adds mirror images of such objects."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import cKDTree
 

@@ -4,8 +4,6 @@ Muon orthogonalizes the momentum of a matrix, so that all its singular direction
 et al. 2024, https://kellerjordan.github.io/posts/muon).
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -4,8 +4,6 @@ The coarse levels are trained first on small images, which cost less.  Finer lev
 a residual of zero (after Karras et al. 2018, Progressive Growing of GANs, arXiv 1710.10196).
 """
 
-from __future__ import annotations
-
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -35,7 +33,7 @@ class Group:
     counts: tuple[int, ...]
 
     @staticmethod
-    def of(objects: list[TrainingViews]) -> Group:
+    def of(objects: list[TrainingViews]) -> "Group":
         parts = {f.name: torch.cat([getattr(o, f.name) for o in objects]) for f in fields(TrainingViews)}
         return Group(TrainingViews(**parts), tuple(len(o.masks) for o in objects))
 

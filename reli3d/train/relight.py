@@ -1,7 +1,5 @@
 """Renders the views of a sample again under another environment and with changed materials, from its G-buffers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,7 +34,7 @@ class Finish:
     metallic: float | None  # value everywhere; None: unchanged
 
     @staticmethod
-    def draw(rng: np.random.Generator) -> Finish:
+    def draw(rng: np.random.Generator) -> "Finish":
         """A random change; the identity with probability 1/2."""
         if rng.random() < 0.5:
             return Finish(1.0, 1.0, 0.0, None)

@@ -5,8 +5,6 @@ processes; a layer is gathered while it computes.  All other parameters are repl
 :mod:`reli3d.train.workers` averages their gradients.  Checkpoints hold full tensors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any
 

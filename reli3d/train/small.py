@@ -1,7 +1,5 @@
 """The training stages of the small network: ``pixels`` trains the 2D U-Net alone, ``small`` the whole network."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Options of the training loop, and the interface of a training stage."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@ Start with ``torchrun --nproc-per-node N``.  On a CPU one single-threaded proces
 of one process with all threads: the operations of a small network are too short for intra-operation parallelism.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +18,7 @@ class Workers:
     count: int = 1
 
     @staticmethod
-    def join() -> Workers:
+    def join() -> "Workers":
         """Joins the process group of torchrun; a group of one process without torchrun."""
         if "RANK" not in os.environ:
             return Workers()

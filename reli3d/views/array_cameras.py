@@ -3,8 +3,6 @@
 Both are matched to images only by the order of the file names, as in the reference readers of these formats.
 """
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 rembg downloads its network from its release page on first use; this module is used only if the user requests it.
 """
 
-from __future__ import annotations
-
 import importlib
 import threading
 from collections.abc import Callable

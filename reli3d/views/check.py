@@ -4,8 +4,6 @@ With correct cameras, the silhouettes of the visual hull fill the masks.  Otherw
 time; the report names the mistake whose correction makes the hull fill the masks.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """View selection by farthest-point sampling of the cameras."""
 
-from __future__ import annotations
-
 import math
 
 import torch

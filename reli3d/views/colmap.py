@@ -5,8 +5,6 @@ are converted to camera-to-world in OpenGL axes.  COLMAP's pixel centers are at 
 https://colmap.github.io/format.html and the list of camera models there.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

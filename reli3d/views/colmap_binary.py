@@ -4,8 +4,6 @@ Source: https://colmap.github.io/format.html#binary-file-format.  Unused data, s
 skipped.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -67,7 +65,7 @@ class _Entries:
     def __init__(self, path: Path):
         self.path, self.size, self.where = path, file_size(path), str(path)
 
-    def __enter__(self) -> _Entries:
+    def __enter__(self) -> "_Entries":
         try:
             self.file = open(self.path, "rb")  # noqa: SIM115 - closed by __exit__
         except OSError as error:

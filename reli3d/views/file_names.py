@@ -1,7 +1,5 @@
 """File names regardless of case: image suffixes and lookup."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path, PurePath

@@ -5,8 +5,6 @@ Supported: ``transforms.json`` (object folders as published, Blender, nerfstudio
 object is separated from the background by the images' alpha, by ``mask_path``, or by files in a folder ``masks``.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Frames of a camera file, checked before the image is read: image file, pose and lens."""
 
-from __future__ import annotations
-
 import math
 import os
 from dataclasses import dataclass

@@ -13,8 +13,6 @@ The field of view is 0.7 radians, as in the ReLi3D release, if neither the frame
 Unsupported keys that resemble lens keys, and lenses other than a pinhole, are errors.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Masks of images: which file belongs to which image, and what its pixel values mean."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath

@@ -1,7 +1,5 @@
 """The error for input without cameras, with the command that estimates them."""
 
-from __future__ import annotations
-
 import os
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Transform from the frame of the input cameras to the network's frame, from a coarse visual hull of the object."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ without antialiasing, mask thresholded at one half after resizing.  The network 
 uses the same steps, listed in docs/model.md.
 """
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Crops and downsamples large images to the resolution that later stages need."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Similarity transforms between frames: a rotation, one scale and a translation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -29,7 +27,7 @@ class Similarity:
     translation: Tensor  # (3,)
 
     @staticmethod
-    def identity() -> Similarity:
+    def identity() -> "Similarity":
         """The identity transform."""
         return Similarity(
             1.0, torch.eye(3, dtype=torch.float64, device="cpu"), torch.zeros(3, dtype=torch.float64, device="cpu")
@@ -46,11 +44,11 @@ class Similarity:
         return self.scale * points @ self.rotation.to(points).T + self.translation.to(points)
 
     @full_precision
-    def inverse(self) -> Similarity:
+    def inverse(self) -> "Similarity":
         """The inverse transform."""
         return Similarity(1 / self.scale, self.rotation.T, -(self.rotation.T @ self.translation) / self.scale)
 
-    def compose(self, first: Similarity) -> Similarity:
+    def compose(self, first: "Similarity") -> "Similarity":
         """The transform that applies ``first``, then this one."""
         return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.apply(first.translation))
 

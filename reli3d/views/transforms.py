@@ -4,8 +4,6 @@ All store camera-to-world matrices in OpenGL axes, which are used as stored; ``a
 not applied.  :mod:`reli3d.views.lens_keys` reads the lens.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Color is sRGB in [0, 1] with straight alpha, including the background.  Cameras 
 (+X right, +Y up, looking along -Z), intrinsics (fx, fy, cx, cy) in pixels with pixel centers at +0.5.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -39,7 +37,7 @@ class ViewBatch:
         """The cameras of all views."""
         return Camera(self.c2w, self.intrinsics, *self.images.shape[2:0:-1])
 
-    def to(self, device: torch.device | str) -> ViewBatch:
+    def to(self, device: torch.device | str) -> "ViewBatch":
         """The same batch with its tensors on ``device``."""
         images, masks, c2w, intrinsics = (t.to(device) for t in (self.images, self.masks, self.c2w, self.intrinsics))
         return ViewBatch(images, masks, c2w, intrinsics, self.names)
@@ -93,7 +91,7 @@ class Views:
     def __len__(self) -> int:
         return len(self.images)
 
-    def select(self, which: int | Sequence[int]) -> Views:
+    def select(self, which: int | Sequence[int]) -> "Views":
         """The first ``which`` views, or the views with indices ``which`` in this order.
 
         Raises ValueError for an index out of range.
@@ -113,11 +111,11 @@ class Views:
             chosen=None,
         )
 
-    def taken(self) -> Views:
+    def taken(self) -> "Views":
         """The views for the network: the views in ``chosen``, or all views if ``chosen`` is None."""
         return self if self.chosen is None else self.select(self.chosen)
 
-    def transformed(self, similarity: Similarity) -> Views:
+    def transformed(self, similarity: Similarity) -> "Views":
         """The same images with the cameras transformed by ``similarity``; intrinsics are unchanged.
 
         ``object_box`` is dropped because it is axis-aligned in the old frame.
@@ -127,7 +125,7 @@ class Views:
         rows = torch.cat([rotation, similarity.apply(c2w[:, :3, 3])[..., None]], -1)
         return replace(self, c2w=torch.cat([rows, c2w[:, 3:]], -2).to(self.c2w.dtype), object_box=None)
 
-    def to(self, device: torch.device | str) -> Views:
+    def to(self, device: torch.device | str) -> "Views":
         """The same views with their tensors on ``device``."""
         images, masks = (tuple(t.to(device) for t in group) for group in (self.images, self.masks))
         return replace(self, images=images, masks=masks, c2w=self.c2w.to(device), intrinsics=self.intrinsics.to(device))

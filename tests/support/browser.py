@@ -4,8 +4,6 @@ Chromium is ``RELI3D_CHROMIUM`` or the first of chromium, chromium-browser and g
 drawn by its software renderer, so no GPU is needed.
 """
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import functools
@@ -44,7 +42,7 @@ class Page:
         page.on("pageerror", lambda error: self.problems.append(str(error)))
         page.on("console", self._note)
 
-    def open(self, url: str, *, size: tuple[int, int] = (512, 512)) -> Page:
+    def open(self, url: str, *, size: tuple[int, int] = (512, 512)) -> "Page":
         """Go to ``url`` with a window of ``size`` pixels; returns once the document is there."""
         self._page.set_viewport_size({"width": size[0], "height": size[1]})
         self._page.goto(url)

@@ -1,7 +1,5 @@
 """A synthetic capture: a textured object on a textured table, photographed along a free path, with ground truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Chi-square test of samples on the sphere against a density [1/sr]; each use shows on the spot that it could fail."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

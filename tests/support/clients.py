@@ -5,8 +5,6 @@ Each client loads ``mesh.glb`` and the light in its usual way: nothing is turned
 is PyPI's bpy: set RELI3D_BPY to a folder with it (``pip install --target``).
 """
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

@@ -1,7 +1,5 @@
 """GLB files by the standard alone: packed, taken apart, and built part by part."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct

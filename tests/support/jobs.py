@@ -1,7 +1,5 @@
 """A job without a network: objects are small files that contain their outcome."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -50,7 +48,7 @@ class WordJob:
             log.write(f"{name}\n")
         return "done"
 
-    def start(self) -> Start:
+    def start(self) -> "Start":
         """Makes this job in another process."""
         return Start(self.log)
 

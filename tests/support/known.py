@@ -3,8 +3,6 @@
 ``KINDS`` maps a name to a function of a random generator that gives a :class:`Case`.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

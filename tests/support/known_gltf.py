@@ -1,7 +1,5 @@
 """GLB files of one quad with random features of glTF 2.0, and their appearance by the standard."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from random import Random

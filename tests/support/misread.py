@@ -1,7 +1,5 @@
 """An input with its ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Mitsuba 3 as an outside judge of images: same mesh, same rays, same material formula, its own geometry and light."""
 
-from __future__ import annotations
-
 import glob
 import math
 import os

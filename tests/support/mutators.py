@@ -1,7 +1,5 @@
 """Random changes of files that know the format: a hostile value in a field, with lengths and checksums made right."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

@@ -5,8 +5,6 @@ any (layouts, one gradient alone, edits in place, dtypes, no rows, second deriva
 operation has tests of its values elsewhere.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

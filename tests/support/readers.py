@@ -1,7 +1,5 @@
 """What reads a user's files, each with files that it accepts: the targets of the campaign."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Directions are in the local frame, normal +z.  Shapes ``(..., 3)`` and ``(...)``; everything float64.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Surfaces with exchanged materials: a region gets its finish, and no placeholder of a scan survives."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Real captures as training objects: images with masks and cameras, without ground-truth materials or lighting."""
 
-from __future__ import annotations
-
 import json
 from functools import lru_cache
 from pathlib import Path

@@ -5,8 +5,6 @@ spherical Gaussians at increasing resolution, last its surface by Monte Carlo in
 values that the paper does not give.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from reli3d.errors import InputError

@@ -1,7 +1,5 @@
 """RENI++ latents of the lighting of training samples, the ground truth of the latent loss."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -3,8 +3,6 @@
 A term whose ground truth a sample lacks is absent from the result instead of zero.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """Renderings of the predicted object in training, and their lighting by spherical Gaussians."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

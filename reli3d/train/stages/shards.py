@@ -1,7 +1,5 @@
 """Training objects in WebDataset tar files: one ``<object>.safetensors`` per object."""
 
-from __future__ import annotations
-
 import tarfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Opens a folder of training objects."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from reli3d.errors import InputError

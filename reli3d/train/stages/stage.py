@@ -1,7 +1,5 @@
 """The training stages of the ReLi3D paper's network."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any

@@ -1,7 +1,5 @@
 """The losses of one object in one stage."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

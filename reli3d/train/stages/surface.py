@@ -1,7 +1,5 @@
 """Differentiable extraction and rendering of the predicted surface, for all stages but ``volume``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Missing ground truth is None and takes part in no loss.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -41,20 +39,20 @@ class ObjectViews:
     def __len__(self) -> int:
         return len(self.images)
 
-    def select(self, views: Sequence[int]) -> ObjectViews:
+    def select(self, views: Sequence[int]) -> "ObjectViews":
         """The views of these indices, in this order."""
         chosen = torch.as_tensor(list(views))
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("latent", "strength")}
         taken: dict[str, Any] = {k: v[chosen] for k, v in values.items() if isinstance(v, Tensor)}
         return replace(self, **taken)
 
-    def to(self, device: torch.device | str) -> ObjectViews:
+    def to(self, device: torch.device | str) -> "ObjectViews":
         """The same views on ``device``."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         moved: dict[str, Any] = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
         return replace(self, **moved)
 
-    def resized(self, size: int) -> ObjectViews:
+    def resized(self, size: int) -> "ObjectViews":
         """The views at ``size`` pixels per side, antialiased; maps are averaged over the pixels that have values."""
         if size == self.images.shape[1]:
             return self
@@ -82,7 +80,7 @@ class ObjectViews:
             changed["shown"] = (fraction[..., 0] > 0.99).float()
         return replace(self, **changed)
 
-    def window(self, x: int, y: int, side: int) -> ObjectViews:
+    def window(self, x: int, y: int, side: int) -> "ObjectViews":
         """Crops of all views: a square of ``side`` pixels with its upper left corner at pixel ``(x, y)``."""
         cut: dict[str, Any] = {}
         for f in fields(self):
@@ -164,7 +162,7 @@ class Draw:
     background_visible: bool
     seed: int  # of the rendering
 
-    def to(self, device: torch.device | str) -> Draw:
+    def to(self, device: torch.device | str) -> "Draw":
         """The same on ``device``."""
         return replace(self, inputs=self.inputs.to(device), targets=self.targets.to(device))
 

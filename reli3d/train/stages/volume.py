@@ -1,7 +1,5 @@
 """Volume rendering of the predicted density, with deferred shading of the material composited along each ray."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
