@@ -1,7 +1,5 @@
 """Visual hull of an object from the masks of posed images, as a signed distance that is positive inside."""
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -10,8 +8,6 @@ from torch import Tensor
 from reli3d._bridge import check, launch
 from reli3d.geometry.camera import Camera, check_camera
 from reli3d.kernels import hull as kernels
-
-BLOCKS_MIN = 64  # blocks of a grid in a CPU slice: each of them has 64 points
 
 
 def mask_distance(masks: Tensor) -> Tensor:
@@ -77,20 +73,9 @@ def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: floa
 
 
 def hull_grid(axis: Tensor, distance: Tensor, camera: Camera, *, far: float = math.inf) -> Tensor:
-    """:func:`hull_distance` on the grid ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, faster and with equal values.
-
-    axis: ``(n,)`` ascending, world units.  distance: ``(V, H, W)`` from :func:`mask_distance`, or any map that changes
-    by at most 1 between adjacent pixels.  camera, far: as in :func:`hull_distance`.
-    """
+    """:func:`hull_distance` on the grid ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, for ``axis (n,)``."""
     check("axis", axis, shape=("n",))
-    _check_views(axis, distance, camera)
-    if not far >= 0.0:
-        raise ValueError(f"far: expected at least 0, got {far}")
-    n = len(axis)
-    hull = axis.new_empty(n, n, n)
-    inputs = [axis.detach().contiguous(), *_views(distance, camera), far, hull]
-    launch(kernels.hull_grid_kernel, (-(-n // kernels.BLOCK_POINTS)) ** 3, inputs, axis.device, slice_min=BLOCKS_MIN)
-    return hull
+    return hull_distance(torch.cartesian_prod(axis, axis, axis), distance, camera, far=far).view(*[len(axis)] * 3)
 
 
 def mirror_residual(

@@ -21,13 +21,8 @@ STEP_FACTOR = wp.constant(0.7)  # of sphere tracing, because distances are up to
 STEP_MIN = wp.constant(4.0e-3)  # world units: thinner parts of the hull may be missed
 STEP_MAX = wp.constant(0.25)
 DEPTH_MIN = wp.constant(1.0e-4)  # world units: points closer to a camera's plane count as behind it
-BLOCK_POINTS = wp.constant(4)  # side of a block of grid points
-BLOCK_VIEWS_MAX = wp.constant(32)  # views that are culled per block; further ones are evaluated at every point
 EXACT_PIXELS = wp.constant(4.0)  # beyond, other segments are at most sqrt(16.5) - 4 = 0.06 pixels nearer
 SEGMENT_PIXELS = wp.constant(16.0)  # beyond, the end of a segment is at most 0.25 / 16 pixels farther than the segment
-
-few = wp.types.vector(length=32, dtype=wp.float32)
-few_numbers = wp.types.vector(length=32, dtype=wp.int32)
 
 
 @wp.func
@@ -74,85 +69,6 @@ def hull_distance_kernel(
 ):
     i = start + wp.tid()
     hull[i] = distance_to_hull(points[i], distance, c2w, intrinsics, far)
-
-
-@wp.func
-def change_in_view(center: wp.vec3, radius: float, value: float, pose: wp.mat44, k: wp.vec4) -> float:
-    """Bound on the change of :func:`distance_in_view`, ``value`` at ``center``, within ``radius``; -1 if points there
-    may lie behind the camera.
-
-    The map changes by at most sqrt(2) per pixel between pixel centers, and mask_distance_kernel errs by up to 1 pixel.
-    """
-    away = center - wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
-    depth = -(pose[0, 2] * away[0] + pose[1, 2] * away[1] + pose[2, 2] * away[2])
-    if not (depth - radius > DEPTH_MIN):
-        return -1.0
-    moved = wp.max(k[0], k[1]) * radius * (wp.length(away) / depth) / (depth - radius)  # pixels
-    pixel = 2.0 / (k[0] + k[1])
-    return (1.4143 * moved + 1.0) * pixel * (depth + radius) + wp.abs(value) / depth * radius
-
-
-@wp.kernel
-def hull_grid_kernel(
-    start: int,
-    # in
-    axis: wp.array[float],  # (N,) ascending
-    distance: wp.array3d[float],
-    c2w: wp.array[wp.mat44],
-    intrinsics: wp.array[wp.vec4],
-    far: float,
-    # out
-    hull: wp.array3d[float],  # (N, N, N)
-):
-    """One thread per block of points, which evaluates only the views that may have the minimum in the block."""
-    i = start + wp.tid()
-    n = axis.shape[0]
-    blocks = (n + BLOCK_POINTS - 1) // BLOCK_POINTS
-    x0 = i // (blocks * blocks) * BLOCK_POINTS
-    y0 = i // blocks % blocks * BLOCK_POINTS
-    z0 = i % blocks * BLOCK_POINTS
-    x1 = wp.min(x0 + BLOCK_POINTS, n)
-    y1 = wp.min(y0 + BLOCK_POINTS, n)
-    z1 = wp.min(z0 + BLOCK_POINTS, n)
-    low = wp.vec3(axis[x0], axis[y0], axis[z0])
-    high = wp.vec3(axis[x1 - 1], axis[y1 - 1], axis[z1 - 1])
-    center = 0.5 * (low + high)
-    radius = 0.5 * wp.length(high - low)
-    greatest = wp.float32(-BEHIND)  # no point of the block is farther inside
-    least = few()  # of each view
-    views = wp.min(c2w.shape[0], BLOCK_VIEWS_MAX)
-    for v in range(views):
-        value = distance_in_view(center, v, distance, c2w, intrinsics)
-        change = change_in_view(center, radius, value, c2w[v], intrinsics[v])
-        least[v] = BEHIND
-        if change >= 0.0:
-            least[v] = value - change
-            greatest = wp.min(greatest, value + change)
-    active = few_numbers()
-    count = wp.int32(0)
-    for v in range(views):
-        if least[v] <= greatest:
-            active[count] = v
-            if least[v] < least[active[0]]:  # the lowest view first, because it is likely below -far
-                active[count] = active[0]
-                active[0] = v
-            count += 1
-    for x in range(x0, x1):
-        for y in range(y0, y1):
-            for z in range(z0, z1):
-                best = greatest
-                if greatest >= -far:
-                    p = wp.vec3(axis[x], axis[y], axis[z])
-                    best = wp.float32(-BEHIND)
-                    k = wp.int32(0)
-                    while k < count and best >= -far:
-                        best = wp.min(best, distance_in_view(p, active[k], distance, c2w, intrinsics))
-                        k += 1
-                    v = views
-                    while v < c2w.shape[0] and best >= -far:
-                        best = wp.min(best, distance_in_view(p, v, distance, c2w, intrinsics))
-                        v += 1
-                hull[x, y, z] = best
 
 
 @wp.kernel

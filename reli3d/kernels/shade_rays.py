@@ -11,12 +11,6 @@ from reli3d.kernels.shade import Light, Plan, Points, draw_sample, make_surface,
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})
 
 
-@wp.func
-def is_known(known: wp.array2d[wp.int32], n_environment: int, sample: int) -> bool:
-    """Whether ``known`` has a bit of this sample: its direction does not depend on the environment."""
-    return known.shape[1] > 0 and sample >= n_environment
-
-
 @wp.kernel
 def shade_rays_kernel(
     start: int,
@@ -25,18 +19,13 @@ def shade_rays_kernel(
     points: Points,
     light: Light,
     plan: Plan,
-    known: wp.array2d[wp.int32],  # without columns: nothing
     # out
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     t_max: wp.array[float],
     values: wp.array[wp.vec3],
 ):
-    """First half of the estimator for a chunk of hits: shadow rays (``t_max`` < 0 where none is needed) and values.
-
-    known: ``visible`` of :func:`accumulate_kernel` under another environment.  It is valid for all samples but those of
-    the environment.
-    """
+    """First half of the estimator for a chunk of hits: shadow rays (``t_max`` < 0 where none is needed) and values."""
     j = start + wp.tid()
     i = first + j
     surface = make_surface(plan, points, i)
@@ -45,14 +34,10 @@ def shade_rays_kernel(
         d = draw_sample(surface, plan, light, s)
         k = j * count + s
         t_max[k] = -1.0
-        found = is_known(known, plan.n_environment, s)
-        if found:
-            values[k] = wp.vec3(0.0, 0.0, 0.0)  # its bit may be set although it adds nothing here
         if d.factor > 0.0:
-            if not found:
-                t_max[k] = wp.inf
-                origins[k] = offset_origin(points.position[i], surface.ng, d.direction, plan.scale)
-                directions[k] = d.direction
+            t_max[k] = wp.inf
+            origins[k] = offset_origin(points.position[i], surface.ng, d.direction, plan.scale)
+            directions[k] = d.direction
             values[k] = sample_value(surface, plan, d, lookup_envmap_uv(light.radiance, d.uv))
 
 
@@ -69,8 +54,6 @@ def accumulate_kernel(
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     values: wp.array[wp.vec3],
-    n_environment: int,
-    known: wp.array2d[wp.int32],
     # in and out
     t_max: wp.array[float],
     # out
@@ -89,10 +72,7 @@ def accumulate_kernel(
         word = wp.int32(0)
         for s in range(count):
             k = j * count + s
-            lit = t_max[k] >= 0.0
-            if is_known(known, n_environment, s):
-                lit = (known[first + j, s // 32] >> (s & 31)) & 1 == 1
-            if lit:
+            if t_max[k] >= 0.0:
                 total = total + values[k]
                 word = word | (1 << (s & 31))
             if (s & 31) == 31 or s == count - 1:

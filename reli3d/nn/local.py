@@ -225,7 +225,7 @@ class LocalReconstructor(nn.Module):
         tokens = torch.cat([features, shape], -1).contiguous()
         maps = ViewMaps(tokens, detail, Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1]), mirrored)
         surface = torch.cat([pixels.depth * mask, mask], -1)
-        volume = (self.volume.fused if inference else self.volume)(maps, surface)
+        volume = self.volume(maps, surface)
         lit = mask[..., 0].clone()
         lit[maps.input_count :] = 0.0
         log_light = self._light(pixels, color, lit, camera)

@@ -4,23 +4,14 @@
 the pooling over the views into one kernel, without gradient; their callers have the differentiable versions in torch.
 """
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from reli3d._bridge import check, launch, struct_of
 from reli3d.geometry.camera import Camera, check_camera
-from reli3d.kernels.view_features import (
-    Viewed,
-    fuse_views_kernel,
-    pool_views_kernel,
-    spread_views_kernel,
-    view_summary_kernel,
-)
+from reli3d.kernels.view_features import Viewed, fuse_views_kernel, pool_views_kernel, view_summary_kernel
 
 BLOCK_CHANNELS = 8  # floats of a kernels.vec8
 NUMBERS = 9  # features of a view at a point; the summary over the views has the same width
-HIDDEN, SPREAD = 32, 24  # widths of the two layers of spread_views, fixed in its kernel
 
 
 def summarize_views(
@@ -67,33 +58,6 @@ def pool_views(
     pooled = points.new_empty(n, hidden)
     layer = [t.detach().contiguous().unflatten(-1, (-1, BLOCK_CHANNELS)) for t in (tokens, mix)]
     launch(pool_views_kernel, n, [viewed, *layer, pooled.unflatten(-1, (-1, BLOCK_CHANNELS)), out], points.device)
-    return pooled, out
-
-
-def spread_views(
-    images: Tensor, tokens: Tensor, mix: Tensor, last: Tensor, bias: Tensor, camera: Camera, points: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Weighted mean and variance over the views of two layers at ``points (N, 3)`` in free space, ``(N, 2 SPREAD)``,
-    and the summary ``(N, 9)`` of :func:`summarize_views`.
-
-    The layers of a view are ``silu(token + features @ mix) @ last + bias``, with tokens, features and mix as in
-    :func:`pool_views` for H = HIDDEN.  last: ``(HIDDEN, SPREAD)``.  bias: ``(SPREAD,)``.  No gradient;
-    :class:`reli3d.nn.volume.FeatureVolume` has the differentiable version in torch.
-    """
-    n, out, viewed = _summary(images, camera, points, None, None)
-    shapes = {
-        "tokens": (tokens, (len(images), *tokens.shape[1:3], HIDDEN)),
-        "mix": (mix, (NUMBERS, HIDDEN)),
-        "last": (last, (HIDDEN, SPREAD)),
-        "bias": (bias, (SPREAD,)),
-    }
-    for name, (value, shape) in shapes.items():
-        check(name, value, like=images)
-        if tuple(value.shape) != shape or (name == "tokens" and min(shape[1:3]) < 2):
-            raise ValueError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
-    layers = [value.detach().contiguous().unflatten(-1, (-1, BLOCK_CHANNELS)) for value, _ in shapes.values()]
-    pooled = points.new_empty(n, 2 * SPREAD)
-    launch(spread_views_kernel, n, [viewed, *layers, pooled.unflatten(-1, (-1, BLOCK_CHANNELS)), out], points.device)
     return pooled, out
 
 

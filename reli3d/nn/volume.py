@@ -1,7 +1,5 @@
 """Feature volume of an object: view features pooled on a grid, a 3D U-Net, and trilinear lookup."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -9,13 +7,13 @@ from torch.nn import functional
 from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_grid
 from reli3d.geometry.projection import gather_views
-from reli3d.nn.blocks import in_rows, linear_of
 from reli3d.nn.presets import VolumeSizes
 from reli3d.nn.view_features import AHEAD, ViewMaps, ahead_of_surface
-from reli3d.nn.view_lookup import HIDDEN, NUMBERS, SPREAD, spread_views, summarize_views
+from reli3d.nn.view_lookup import NUMBERS, summarize_views
 
 NEAR_HULL = 0.08  # model units: grid points farther outside the visual hull are left zero
 HULL_SCALE = 0.1  # model units per unit of the hull distance as a feature
+HIDDEN, SPREAD = 32, 24  # widths of the two layers on the features of a view
 
 
 def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -48,39 +46,15 @@ class FeatureVolume(nn.Module):
         self.side, self.radius = sizes.side, sizes.radius
 
     def forward(self, maps: ViewMaps, surface: Tensor) -> Tensor:
-        """Features ``(N, N, N, F)``, indexed x, y, z.
+        """Features ``(N, N, N, F)``, indexed x, y, z; grid points far outside the visual hull enter as zeros.
 
-        surface: as in :func:`~reli3d.nn.view_features.ahead_of_surface`.
-
-        Gradients reach the tokens, the surface and every parameter.
+        surface: as in :func:`~reli3d.nn.view_features.ahead_of_surface`.  Gradients reach the tokens, the surface and
+        every parameter.
         """
-        grid, near, hull = self._near_hull(maps)
-        return self._filled(near, self._reduced(maps, surface, grid[near], hull[near], *self._pooled(maps, grid[near])))
-
-    @torch.no_grad()
-    def fused(self, maps: ViewMaps, surface: Tensor) -> Tensor:
-        """:meth:`forward` by :func:`~reli3d.nn.view_lookup.spread_views`, equal to float32 rounding; no gradient."""
-        first, last = linear_of(self.mix, 0), linear_of(self.mix, 2)
-        # bilinear weights sum to 1, so the first layer commutes with the lookup
-        tokens = functional.linear(maps.tokens, first.weight[:, :-NUMBERS], first.bias)
-        layers = tokens, first.weight[:, -NUMBERS:].T, last.weight.T, last.bias
-
-        def reduced(points: Tensor, hull: Tensor) -> dict[str, Tensor]:
-            pooled, summary = spread_views(maps.images, *layers, maps.camera, points)
-            return {"reduced": self._reduced(maps, surface, points, hull, pooled, summary)}
-
-        grid, near, hull = self._near_hull(maps)
-        return self._filled(near, in_rows(reduced, grid[near], hull[near])["reduced"])
-
-    def _near_hull(self, maps: ViewMaps) -> tuple[Tensor, Tensor, Tensor]:
-        """All grid points ``(N**3, 3)``, the indices of those near the visual hull, and the distance to it."""
         axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device, dtype=torch.float32)
-        grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
         hull = hull_grid(axis, maps.silhouette, maps.camera, far=NEAR_HULL).view(-1)
-        return grid, (hull > -NEAR_HULL).nonzero()[:, 0], hull
-
-    def _filled(self, near: Tensor, reduced: Tensor) -> Tensor:
-        """Output of the U-Net for ``reduced`` features at the grid points ``near``, zero elsewhere."""
+        near = (hull > -NEAR_HULL).nonzero()[:, 0]
+        reduced = self._reduced(maps, surface, torch.cartesian_prod(axis, axis, axis)[near], hull[near])
         x = reduced.new_zeros(self.side**3, reduced.shape[1]).index_copy(0, near, reduced)
         x = x.reshape(1, self.side, self.side, self.side, -1).permute(0, 4, 1, 2, 3)  # channels last: half the time
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):
@@ -98,19 +72,15 @@ class FeatureVolume(nn.Module):
             x = up(finer + coarse)
         return self.out(x)
 
-    def _pooled(self, maps: ViewMaps, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Weighted mean and variance over the views of two layers ``(N, 2 SPREAD)``, and the summary ``(N, 9)``."""
+    def _reduced(self, maps: ViewMaps, surface: Tensor, points: Tensor, hull: Tensor) -> Tensor:
+        """Features of ``points (N, 3)``: weighted mean and variance of two layers over the views, and numbers."""
         gathered, _ = gather_views(maps.tokens, points, maps.camera)
         numbers, weight, summary = summarize_views(maps.images, maps.camera, points, None, None)
         mixed = self.mix(torch.cat([gathered, numbers], -1))
         mean = (mixed * weight[..., None]).sum(1)
-        return torch.cat([mean, ((mixed - mean[:, None]).square() * weight[..., None]).sum(1)], -1), summary
-
-    def _reduced(
-        self, maps: ViewMaps, surface: Tensor, points: Tensor, hull: Tensor, pooled: Tensor, summary: Tensor
-    ) -> Tensor:
+        variance = ((mixed - mean[:, None]).square() * weight[..., None]).sum(1)
         rest = torch.stack([(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(maps.images))], -1)
-        return self.reduce(torch.cat([pooled, summary, rest, ahead_of_surface(surface, maps, points)], -1))
+        return self.reduce(torch.cat([mean, variance, summary, rest, ahead_of_surface(surface, maps, points)], -1))
 
     def sample(self, volume: Tensor, points: Tensor) -> Tensor:
         """Trilinear interpolation ``(N, F)`` of ``volume`` at ``points (N, 3)``, clamped to the border."""

@@ -1,7 +1,5 @@
 """Renders assets: primary visibility, materials, direct lighting with shadows, background, subpixel averaging."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -18,7 +16,7 @@ from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from reli3d.render.points import SurfacePoints
-from reli3d.render.shading import DEFAULT, ShadeOptions, shade_lights
+from reli3d.render.shading import DEFAULT, ShadeOptions, shade
 
 if TYPE_CHECKING:
     from reli3d.render.allocation import SamplePlan
@@ -185,7 +183,7 @@ def plan_render(
     shadows: bool = True,
     scene: RayScene | None = None,
     relative: bool = False,
-) -> SamplePlan:
+) -> "SamplePlan":
     """Divides ``total`` samples among the strategies to minimize the noise of :func:`render_asset` for this view.
 
     Use the plan's counts with ``antithetic="none"``.  Arguments as in :func:`render_asset`; total, relative: as in
@@ -274,7 +272,7 @@ def _band(parts, camera, lights, scene, first, shadows, background, options) -> 
     index = (seen // inner.width + top) * camera.width + seen % inner.width + left
     points = _points(parts, hits.face[seen], hits.bary[seen])
     shadowed, pixels, wo = scene if shadows else None, (index + first).int(), -directions[seen]
-    lit = shade_lights(points, wo, lights, scene=shadowed, options=options, pixels=pixels)
+    lit = [shade(points, wo, light, scene=shadowed, options=options, pixels=pixels) for light in lights]
     axis = -camera.c2w[:3, 2]
     depth = ((points.position - camera.position) * axis).sum(-1, keepdim=True)
     layers = [

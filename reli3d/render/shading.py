@@ -1,9 +1,7 @@
 """Direct lighting of surface points by multiple importance sampling, with optional shadow rays."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -131,42 +129,14 @@ def shade(
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
     >>> radiance = reli3d.shade(points, wo, reli3d.Environment.constant(torch.ones(3)))
     """
-    return _Shade.apply(*_task(points, wo, environment, scene, options, pixels))
-
-
-def shade_lights(
-    points: SurfacePoints,
-    wo: Tensor,
-    environments: Sequence[Environment],
-    *,
-    scene: RayScene | None = None,
-    options: ShadeOptions = DEFAULT,
-    pixels: Tensor | None = None,
-) -> list[Tensor]:
-    """:func:`shade` under each of ``environments``, bitwise equal to single calls.
-
-    If no gradients are needed, shadow rays that do not depend on the environment are traced only once.
-    """
-    tasks = [_task(points, wo, light, scene, options, pixels) for light in environments]
-    recorded = torch.is_grad_enabled() and any(v.requires_grad for _, *tensors in tasks for v in tensors)
-    if recorded or len(tasks) < 2 or scene is None or scene.backend != "embree":
-        return [_Shade.apply(*task) for task in tasks]
-    (job, *tensors), *others = tasks
-    first, known = _direct(job, tensors, words=job.words)
-    return [first, *(_direct(replace(job, known=known), tensors)[0] for job, *tensors in others)]
-
-
-def _task(points, wo, environment, scene, options, pixels) -> tuple:
-    """What :class:`_Shade` takes, from the arguments of :func:`shade`."""
     values = shaded_arrays(points, wo, environment, scene, options)
     plan, offsets = sampling_plan(options, scene)
     n, device = len(points), points.position.device
-    job = _Job(plan, sum(options.samples), scene, environment.cdf, offsets.to(device), _nothing_known(device))
+    job = _Job(plan, sum(options.samples), scene, environment.cdf, offsets.to(device))
     if pixels is None:
         pixels = torch.arange(n, dtype=torch.int32, device=device)
     check("pixels", pixels, shape=(n,), like=points.position, dtype=torch.int32)
-    values = (*values, environment.radiance, pixels)
-    return job, *(v.contiguous() for v in values)
+    return _Shade.apply(job, *(v.contiguous() for v in (*values, environment.radiance, pixels)))
 
 
 @dataclass(frozen=True)
@@ -178,31 +148,6 @@ class _Job:
     scene: RayScene | None
     cdf: EnvironmentCDF
     offsets: Tensor
-    known: Tensor  # ``visible`` of the same hits and samples under another light, without columns for none
-
-    @property
-    def words(self) -> int:
-        """Columns of ``visible``: a bit a sample."""
-        return -(-self.count // 32)
-
-
-def _nothing_known(device: torch.device) -> Tensor:
-    return torch.empty(0, 0, dtype=torch.int32, device=device)
-
-
-def _direct(job: _Job, tensors: Sequence[Tensor], words: int = 0) -> tuple[Tensor, Tensor]:
-    """Radiance ``(N, 3)``, and ``visible (N, words)``: a bit for each sample that is lit."""
-    position, n = tensors[0], tensors[0].shape[0]
-    visible = torch.zeros(n, words, dtype=torch.int32, device=position.device)
-    out = empty((n,), wp.vec3, position.device)
-    ins = _inputs(tensors, job)
-    if job.scene is not None and job.scene.backend == "embree" and job.scene.faces.shape[0]:
-        _shade_embree(n, ins, job, out, visible)
-    else:
-        mesh = job.scene.mesh_id if job.scene is not None else 0
-        launch(kernels.shade_kernel, n, [*ins, job.plan, mesh, int(mesh != 0), out, visible], position.device)
-    out += nan_where_not_finite(tensors[:7])
-    return out, visible
 
 
 class _Shade(torch.autograd.Function):
@@ -210,7 +155,16 @@ class _Shade(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, job: _Job, *tensors: Tensor) -> Tensor:
-        out, visible = _direct(job, tensors, words=job.words if any(ctx.needs_input_grad[1:]) else 0)
+        n, device = tensors[0].shape[0], tensors[0].device
+        words = -(-job.count // 32) if any(ctx.needs_input_grad[1:]) else 0  # a bit for each sample that is lit
+        visible, out = torch.zeros(n, words, dtype=torch.int32, device=device), empty((n,), wp.vec3, device)
+        ins = _inputs(tensors, job)
+        if job.scene is not None and job.scene.backend == "embree" and job.scene.faces.shape[0]:
+            _shade_embree(n, ins, job, out, visible)
+        else:
+            mesh = job.scene.mesh_id if job.scene is not None else 0
+            launch(kernels.shade_kernel, n, [*ins, job.plan, mesh, int(mesh != 0), out, visible], device)
+        out += nan_where_not_finite(tensors[:7])
         ctx.job = job
         ctx.save_for_backward(*tensors, visible)
         return out
@@ -274,7 +228,7 @@ def _shade_embree(n: int, ins: list, job: _Job, out: Tensor, visible: Tensor) ->
     size = max(1, CHUNK_RAYS // count)
     group = max(1, GROUP_RAYS // count)
     # views once for all chunks: a third of the cost of a chunk without its rays
-    known, outs = view(job.known, wp.int32), [view(out, wp.vec3), view(visible, wp.int32)]
+    outs = [view(out, wp.vec3), view(visible, wp.int32)]
 
     def work(_, start, length):
         buffers = [torch.empty(min(size, length) * count, 3, dtype=torch.float32, device="cpu") for _ in range(3)]
@@ -282,10 +236,9 @@ def _shade_embree(n: int, ins: list, job: _Job, out: Tensor, visible: Tensor) ->
         origins, directions, values, t_max = *(view(v, wp.vec3) for v in buffers), view(far, wp.float32)
         for first in range(start, start + length, size):
             hits = min(size, start + length - first)
-            args = [first, *ins, job.plan, known, origins, directions, t_max, values]
+            args = [first, *ins, job.plan, origins, directions, t_max, values]
             launch(halves.shade_rays_kernel, hits, args, out.device)
-            rays = [origins, directions, values, job.plan.n_environment, known, t_max]
-            args = [first, hits, group, count, *tracer, *rays, *outs]
+            args = [first, hits, group, count, *tracer, origins, directions, values, t_max, *outs]
             launch(halves.accumulate_kernel, -(-hits // group), args, out.device)
 
     if n:

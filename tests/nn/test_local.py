@@ -16,7 +16,6 @@ from reli3d.nn.local import LocalReconstructor, PixelMaps, mean_logit
 from reli3d.nn.presets import SMALL, LightMapSizes, PyramidSizes, VolumeSizes
 from reli3d.nn.pyramid import pixel_hull_depths, pixel_positions
 from reli3d.nn.view_features import ViewMaps, ahead_of_surface
-from reli3d.nn.view_lookup import spread_views
 from reli3d.nn.volume import FeatureVolume
 from reli3d.render.latlong import lat_long_directions, lat_long_texels
 
@@ -300,28 +299,6 @@ def test_the_fused_pass_is_the_one_that_trains(model):
     torch.testing.assert_close(got.numbers[:, :9], expected.numbers[:, :9].detach(), rtol=0, atol=5e-5)
     # the root of a difference of squares: 1e-3 where the views agree
     torch.testing.assert_close(got.numbers[:, 9], expected.numbers[:, 9].detach(), rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("views", [1, 5])
-def test_the_volume_of_inference_is_the_one_that_trains(model, views):
-    """Two layers and their spread over the views in one kernel, against torch's operations, which have the gradient."""
-    inputs = sphere(views)
-    expected, got = encoded(model, *inputs), encoded(model, *inputs, inference=True)
-    assert expected.volume.requires_grad and not got.volume.requires_grad
-    exact = expected.volume.detach()
-    assert exact.std() > 0.05
-    # sums of 32 float32 terms in another order, through six convolutions
-    torch.testing.assert_close(got.volume, exact, rtol=0, atol=1e-4 * float(exact.abs().max()))
-
-
-def test_layers_of_other_widths_than_the_kernel_has_are_refused():
-    images, points = torch.rand(2, 8, 8, 4), torch.rand(5, 3)
-    camera = Camera(torch.eye(4).expand(2, 4, 4).contiguous(), torch.tensor([[8.0, 8, 4, 4]] * 2), 8, 8)
-    layers = [torch.rand(2, 4, 4, 32), torch.rand(9, 32), torch.rand(32, 24), torch.rand(24)]
-    wrong = {"tokens": (2, 4, 4, 16), "mix": (8, 32), "last": (32, 16), "bias": (8,)}
-    for k, (name, shape) in enumerate(wrong.items()):
-        with pytest.raises(ValueError, match=f"{name}: expected shape"):
-            spread_views(images, *layers[:k], torch.rand(shape), *layers[k + 1 :], camera, points)
 
 
 def test_the_volume_is_read_where_it_was_written():

@@ -16,10 +16,9 @@ from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.image import render_asset, render_lights
 from reli3d.render.material import DIFFUSE_MODELS
-from reli3d.render.shading import ShadeOptions, shade, shade_lights
+from reli3d.render.shading import ShadeOptions
 from tests.support import reference
-from tests.support.scenes import ball, eye, shadow_caster, sky, textures
-from tests.support.surfaces import inputs, on_ball
+from tests.support.scenes import ball, eye, textures
 
 
 def square(device, normals=True):
@@ -184,24 +183,6 @@ def test_rays_that_miss_the_asset_are_skipped_without_effect_on_the_image(device
                 whole = render_asset(asset, camera, env, supersampling=2)
             for field in fields(whole):
                 assert torch.equal(getattr(boxed, field.name), getattr(whole, field.name)), (place, cx, field.name)
-
-
-@pytest.mark.parametrize("counts", [(2, 1, 1), (20, 40, 4), (0, 3, 2), (5, 0, 0)])
-@pytest.mark.parametrize("sequence", ["halton", "random"])
-def test_shadows_found_for_one_light_are_those_of_the_others(device, counts, sequence):
-    """More than 32 samples take two words of bits; without gradient and with one."""
-    normal, wo, *rest = inputs(3000, device)
-    scene, options = shadow_caster(device), ShadeOptions(samples=counts, sequence=sequence)
-    lights = [sky(seed=1).to(device), Environment(torch.zeros(8, 16, 3, device=device)), sky(seed=2).to(device)]
-    for base in (rest[0], rest[0].clone().requires_grad_()):
-        args = on_ball(normal, wo, base, *rest[1:])
-        together = shade_lights(*args, lights, scene=scene, options=options)
-        black_first = shade_lights(*args, lights[1:], scene=scene, options=options)
-        for light, got in zip((*lights, *lights[1:]), (*together, *black_first), strict=True):
-            assert torch.equal(got, shade(*args, light, scene=scene, options=options))
-            assert got.requires_grad == base.requires_grad
-        free = shade(*args, lights[2], options=options)
-        assert bool((together[2] < 0.9 * free).any())  # the ball is in the way of something
 
 
 def test_image_gradient_reaches_textures_and_light(device):

@@ -1,7 +1,5 @@
 """The operations of geometry and renderer that have no gradient, as in ``tests/support/op_cases.py``."""
 
-from __future__ import annotations
-
 import torch
 from torch.nn.functional import normalize
 
@@ -86,11 +84,7 @@ def seen_from(points, normal):
     pooled, _ = view_lookup.pool_views(images, tokens, mix, camera, points, visible.float(), normal)
     pixels = uniform(3, 3, 8, 8, 4, seed=6).to(points)
     fused = view_lookup.fuse_views(images, pixels, camera, points, visible.float(), normal)
-    layers = [
-        uniform(*shape, seed=7 + k).to(points) for k, shape in enumerate([(3, 8, 8, 32), (9, 32), (32, 24), (24,)])
-    ]
-    spread, _ = view_lookup.spread_views(images, *layers, camera, points)
-    return visible, own, fraction, total, pooled, *fused, spread
+    return visible, own, fraction, total, pooled, *fused
 
 
 def hulls(masks, points):
