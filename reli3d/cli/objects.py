@@ -230,10 +230,7 @@ def _rows(
     *,
     alone: bool,
 ) -> Rows:
-    """Keeps up to ``limit()`` objects submitted; one whose future raises ``crash`` is submitted once more.
-
-    alone: a crash breaks all futures, so an object is retried only while no other one is submitted.
-    """
+    """Keeps ``limit()`` objects submitted; one that raises ``crash``, which breaks all futures, is retried alone."""
     left, again, running = deque(items), deque[Item](), dict[Future, tuple[Item, bool]]()
     while left or again or running:
         if again and not (alone and running):

@@ -185,18 +185,14 @@ def bake(
     values: Tensor | None = None,
     fill: bool = True,
 ) -> dict[str, Tensor]:
-    """Evaluates ``fn`` at the texels of an atlas; returns maps ``{name: (size, size, C)}`` float32.
+    """Evaluates ``fn`` at the texels of an atlas; returns maps ``{name: (size, size, C)}`` float32, not clamped.
 
-    mesh: with ``uv``; only the part in [0, 1] is baked.  size: texels per side, 1 to 16384; row 0 is v = 0.  fn: called
-    as ``fn(position (N, 3), normal (N, 3))`` with at most ``chunk`` surface points at a time, under ``torch.no_grad``;
-    returns ``{name: (N, C)}``, or one tensor, which is named "value".  Results are stored unchanged, in any range;
-    :class:`~reli3d.render.asset.TextureSet` expects [0, 1].  texels: from
-    :func:`~reli3d.geometry.bake.rasterize_texels`, for reuse.  tangents: also pass tangents ``(N, 4)`` as the third
-    argument.  values: vertex attributes ``(V, C)``, interpolated and passed as the last argument.  fill: fill uncovered
-    texels from the nearest covered one; if False, they are 0.
+    mesh: with ``uv``, baked in [0, 1].  size: texels per side, 1 to 16384; row 0: v = 0.  fn: ``fn(position (N, 3),
+    normal (N, 3))``, N at most ``chunk``, without gradient, returns ``{name: (N, C)}`` or one tensor, "value".  texels:
+    from :func:`~reli3d.geometry.bake.rasterize_texels`.  tangents: also pass ``(N, 4)``.  values: vertex attributes
+    ``(V, C)``, interpolated as the last argument.  fill: from the nearest covered texel, else 0.
 
-    No gradient.  Raises TypeError for a wrong type or dtype; ValueError without ``uv``, if the surface covers no texel,
-    or if ``fn`` returns a wrong shape, or varying names or numbers of channels.
+    Raises TypeError for a wrong type or dtype; ValueError without ``uv`` or covered texels, or for wrong results.
 
     >>> maps = reli3d.bake(mesh, 64, lambda position, normal: 0.5 + 0.5 * normal)
     >>> textures = reli3d.TextureSet(maps["value"], roughness=0.5, metallic=0.0)

@@ -137,10 +137,7 @@ def _frames(normal: np.ndarray, label: np.ndarray, chart: np.ndarray, count: int
 
 
 def _upright(right: np.ndarray, up: np.ndarray, points: np.ndarray, chart: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Frames turned to the smallest bounding box with its longer side up, and the minimum ``(N, 2)`` of each chart.
-
-    points: ``(P, 3)`` that hold the extremes of their ``chart`` (P,).
-    """
+    """Frames turned to the smallest box, longer side up, of ``points (P, 3)``, and minima ``(N, 2)``."""
     order, start = group(chart)
     points, chart = points[order], chart[order]
     x0, y0 = np.einsum("pk,pk->p", points, right[chart]), np.einsum("pk,pk->p", points, up[chart])
@@ -183,11 +180,7 @@ def _cut_bulky(
     longest: float,
     neighbors: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Charts with mostly empty boxes, cut in two if that saves area: ``(chart, parent of each chart)`` or None.
-
-    points: ``(F, 3)`` centers of the faces.  area: of each chart.  waste: empty area [texels] that is worth a cut.
-    longest: [texels] a longer chart is halved in any case, since it would set the scale of all the others.
-    """
+    """``(chart, parent of each)``, cut in two where that saves ``waste`` [texels] or beyond ``longest``, or None."""
     outer = outer_faces(chart, neighbors)
     order, start = group(chart[outer])
     outer = outer[order]

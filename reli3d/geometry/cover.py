@@ -16,15 +16,14 @@ FIELD_MAX = 3.0  # rays whose minimum is above this stay empty: inconsistent mas
 def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Camera, *, radius: float) -> Tensor:
     """Lowers ``sdf (X, Y, Z)`` so that every ray inside the views' silhouettes hits the surface; no gradient.
 
-    sdf: negative inside, on a grid over [-radius, radius]^3, in occupancy logits or in distances divided by the
-    softness.  bound: ``(X, Y, Z)``, a lower bound on ``sdf`` and on the result.  distance, camera: as in
-    :func:`reli3d.geometry.hull.hull_distance`, at least ``2 STRIDE`` pixels per side.  Without views, the result is a
-    copy of ``sdf``.
+    sdf: negative inside, on a grid over [-radius, radius]^3, in occupancy logits or distances divided by the softness.
+    bound: ``(X, Y, Z)``, lower bound on ``sdf`` and on the result.  distance, camera: as in
+    :func:`reli3d.geometry.hull.hull_distance`, at least ``2 STRIDE`` pixels per side.  Without views: a copy of
+    ``sdf``.
 
-    Predicted fields often stay slightly above 0 along rays through thin parts.  One ray is traced for every
-    ``STRIDE``-th pixel of each axis; if the minimum m along it is in (-DEPTH, FIELD_MAX), m + DEPTH is subtracted along
-    the ray.  Source: own.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device, or a
-    radius that is not positive.
+    Predicted fields often stay slightly above 0 in thin parts.  Every ``STRIDE``-th pixel of each axis has a ray; if
+    the minimum m along it is in (-DEPTH, FIELD_MAX), m + DEPTH is subtracted along the ray.  Source: own.  Raises
+    TypeError for a wrong dtype, ValueError for a wrong shape, device or radius.
     """
     check("sdf", sdf)
     if sdf.ndim != 3 or min(sdf.shape) < 2:

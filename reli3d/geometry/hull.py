@@ -55,12 +55,12 @@ def _nearest_crossing(masks: Tensor) -> list:
 def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: float = math.inf) -> Tensor:
     """Signed distance ``(N,)`` of points to the visual hull, world units, positive inside: the minimum over the views.
 
-    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  camera: a batch of these V views.  The
-    distance in a view is the pixel distance at the point's projection times depth / focal length, which overestimates
-    by a factor of up to 1 / cos^2 of the angle to the optical axis.  Outside the image, the border value is used, so a
-    silhouette that is cut off there is unbounded.  Points at or behind a camera's plane get -1000.  Without views,
-    every point gets +1000.  far: at least 0, world units, else ValueError; to save time, points farther outside may get
-    any value below ``-far``.  No gradient.
+    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  camera: a batch of these V views.  A
+    view's distance is the pixel distance at the point's projection times depth / focal length, too large by a factor of
+    up to 1 / cos^2 of the angle to the optical axis.  Outside the image, the border value counts: silhouettes cut off
+    there are unbounded.  Points at or behind a camera's plane get -1000; without views, all get +1000.  far: world
+    units, at least 0, else ValueError; points farther outside may get any value below ``-far``, which saves time.  No
+    gradient.
     """
     check("points", points, shape=("N", 3))
     _check_views(points, distance, camera)

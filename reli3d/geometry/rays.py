@@ -92,14 +92,12 @@ class RayScene:
         """First hit of every ray, differentiable in the rays and in ``vertices``.
 
         origins, directions: ``(..., 3)`` float32, broadcast; ``t`` is in units of the length of ``directions``.
-        vertices: ``(V, 3)``, the tensor that receives gradients, equal to the vertices of the scene (call :meth:`refit`
-        after a change); None: no vertex gradients, even if the mesh's vertices require them.  t_max: a number or
-        ``(...)``, exclusive.  A miss has ``face = -1``, ``t = inf``, ``bary = 0`` and gradient 0.
+        vertices: ``(V, 3)``, receives gradients, equal to the scene's (see :meth:`refit`).  t_max: a number or
+        ``(...)``, exclusive.  A miss has ``face = -1``, ``t = inf``, ``bary = 0``, gradient 0.
 
-        Gradients of ``t`` and ``bary`` reach origins, directions and vertices.  The choice of the face is not
-        differentiated, so silhouettes need :func:`reli3d.antialias`.  ``origins + t * directions`` is the most accurate
-        hit position.  Raises TypeError for a wrong dtype; ValueError for a wrong shape or device, or if ``vertices``
-        differ from the scene's.  Source: Moller and Trumbore 1997, in float64.
+        The choice of the face has no gradient: silhouettes need :func:`reli3d.antialias`.  ``origins + t * directions``
+        is the most accurate position.  Raises TypeError for a wrong dtype; ValueError for a wrong shape or device, or
+        other ``vertices``.  Source: Moller and Trumbore 1997, in float64.
 
         >>> hits = scene.intersect(origins, directions, vertices=v)
         >>> points = origins[hits.valid] + hits.t[hits.valid][:, None] * directions[hits.valid]
@@ -229,10 +227,7 @@ class RayScene:
             over_slices(n, work, slice_min=max(SLICE_RAYS, n // (THREAD_SLICES * torch.get_num_threads())))
 
     def _order(self, o: Tensor, d: Tensor) -> np.ndarray | None:
-        """Permutation that brings like rays together, None where they are few or come in such an order already.
-
-        Embree traces one ray after the other; neighbors that visit the same nodes find them in the cache.
-        """
+        """Permutation that brings like rays together, for the cache; None for few rays or ones in such an order."""
         n = o.shape[0]
         if n < SLICE_RAYS:
             return None

@@ -16,12 +16,11 @@ def sparse_sdf(known: Tensor, near: Tensor, evaluate: Callable[[Tensor], Tensor]
     no neighbor has the opposite sign.  evaluate: maps flat point indices ``(N,)`` to field values ``(N,)``.
 
     1. Every second point of ``near`` along each axis is evaluated.
-    2. The points of ``near`` between them are evaluated, except in coarse cells with all corners below
-       ``-INSIDE_DEPTH``.
-    3. Neighbors across a sign change are evaluated until all are known.
+    2. The points of ``near`` between them are, except in coarse cells with all corners below ``-INSIDE_DEPTH``.
+    3. Neighbors across a sign change are, until all are known.
 
-    A closed cavity that contains no point of step 1 is missed.  No gradient.  Raises ValueError for a wrong shape,
-    TypeError unless ``near`` is bool.
+    A closed cavity without a point of step 1 is missed.  No gradient.  Raises ValueError for a wrong shape, TypeError
+    unless ``near`` is bool.
     """
     if known.ndim != 3 or min(known.shape) < 3 or near.shape != known.shape:
         raise ValueError(

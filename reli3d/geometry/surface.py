@@ -3,8 +3,10 @@
 A grid of X * Y * Z cubes fills the box [-radius, radius]^3.  Grid vertices ``(X + 1, Y + 1, Z + 1)`` and cubes ``(X, Y,
 Z)`` are in C order (x slowest, z fastest).  Corners of a cube are numbered with x fastest: corner = x + 2y + 4z for x,
 y, z in {0, 1}; edges as in ``kernels.flexicubes_tables.EDGES``.  Vertices and faces are in the order of the authors'
-code.  After one pass over the grid the cost is proportional to the number of surface cubes.  Not implemented: the
-tetrahedra of the paper's section 4.5, and dual vertices placed by the field's gradient.
+code, bitwise identical for any number of threads; faces are counter-clockwise seen from the positive side.  A positive
+field gives an empty mesh, a negative one the box if ``closed``.  After one pass over the grid the cost is proportional
+to the number of surface cubes.  Not implemented: the tetrahedra of the paper's section 4.5, and dual vertices placed by
+the field's gradient.
 """
 
 from collections.abc import Sequence
@@ -104,23 +106,15 @@ def extract_surface(
     closed: bool = True,
     center: bool = False,
 ) -> Mesh:
-    """Extracts the isosurface ``sdf == 0`` in the box ``[-radius, radius]^3`` by FlexiCubes; the mesh has no normals.
+    """Isosurface ``sdf == 0`` of a grid over ``[-radius, radius]^3`` by FlexiCubes (Shen et al. 2023), without normals.
 
-    sdf: ``(X + 1, Y + 1, Z + 1)`` float32 at the grid vertices (C order: x slowest, z fastest), finite; a signed
-    distance or any other field that is negative inside.  radius: half extent of the box, one or three numbers.
-    deformation: ``(*sdf.shape, 3)`` offsets of the grid vertices, as fractions of the box sides ``2 * radius``.  alpha
-    ``(K, 8)``, beta ``(K, 12)``, gamma ``(K,)``: positive weights for cube corners, cube edges and quad splitting;
-    None: 1.  K is the number of all cubes, X * Y * Z, unless ``cubes`` is given.  cubes: ``(K,)`` int64 from
-    :func:`~reli3d.geometry.surface.surface_cubes`; the weights then have rows for these cubes only.  closed: cap the
-    surface at the box.  center: split each quad into four triangles around an additional vertex, not into two.
+    sdf: ``(X+1, Y+1, Z+1)`` float32, negative inside.  radius: one or three numbers.  deformation: ``(*sdf.shape, 3)``,
+    fractions of the box sides.  alpha ``(K, 8)``, beta ``(K, 12)``, gamma ``(K,)``: positive weights of cubes' corners,
+    edges and quads; all, or ``cubes (K,)`` from :func:`surface_cubes`.  closed: capped.  center: four triangles per
+    quad.
 
-    Faces are counter-clockwise seen from the positive side.  A field of one sign is valid: a positive field gives an
-    empty mesh, a negative field the box if ``closed``.  Gradients reach sdf, deformation, alpha, beta and, with
-    ``center``, gamma.  Bitwise identical for any number of threads.
-
-    Raises TypeError for a wrong dtype, and ValueError in these cases: a wrong shape; NaN or infinity in ``sdf``;
-    ``radius`` or ``gamma`` not positive; ``alpha``, ``beta`` or ``deformation`` that lead to non-finite vertices;
-    ``cubes`` that do not match ``sdf``; 2^31 or more grid vertices.  Source: Shen et al. 2023.
+    Gradients reach sdf, deformation, alpha, beta and, with ``center``, gamma.  Raises TypeError for a wrong dtype,
+    ValueError for wrong shapes or values, non-finite vertices, 2^31 grid vertices.
 
     >>> x = torch.linspace(-1, 1, 17)
     >>> ball = reli3d.extract_surface((x**2 + x[:, None] ** 2 + x[:, None, None] ** 2).sqrt() - 0.5, radius=1.0)

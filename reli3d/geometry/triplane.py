@@ -118,9 +118,7 @@ def _segments(points: Tensor, width: int) -> int:
 
 
 def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Points of every plane ``(3 * B, N)`` int32 by row of cells, along a row roughly by column, points that miss the
-    plane last; and the start of every segment of the rows and their end, ``(3 * B, (height + 1) * segments + 1)`` int32
-    (:func:`_segments`)."""
+    """Points of every plane ``(3 B, N)`` by row of cells, misses last; starts of :func:`_segments` and end."""
     slabs, n, segments = points.shape[0] * 3, points.shape[1], _segments(points, width)
     bins = segments * SEGMENT if points.is_cuda else 2**16 // (height + 2)
     keys = torch.empty(slabs, n, dtype=torch.int32, device=points.device)
@@ -200,15 +198,12 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
 def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
     """Samples features ``(B, N, 3 * C)`` float32 at ``points``, bilinearly from the planes XY, XZ, YZ, in that order.
 
-    planes: ``(B, 3, C, H, W)`` float32, bfloat16 or float16; interpolated in float32.  The first coordinate of a plane
-    runs along W, the second along H.  Borders are as in ``grid_sample`` with ``align_corners=False`` and
-    ``padding_mode="zeros"``: -1 and 1 are the outer edges of the border texels, and texels outside are zero.  Planes
-    are read without a copy if they are float32, C is a multiple of 8 and channels are last in memory; otherwise they
-    are converted to this layout.  points: ``(B, N, 3)`` float32 in [-1, 1]; NaN gives zeros.
+    planes: ``(B, 3, C, H, W)`` float32, bfloat16 or float16; the first coordinate of a plane runs along W.  As
+    ``grid_sample`` with ``align_corners=False``, ``padding_mode="zeros"``, in float32.  Not copied if float32, C a
+    multiple of 8, channels last.  points: ``(B, N, 3)`` float32 in [-1, 1]; NaN gives zeros.
 
-    Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centers), bitwise identical for any
-    number of threads.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device, or for sizes beyond
-    32-bit indices.
+    Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centers), bitwise reproducibly.
+    Raises TypeError for a wrong dtype, ValueError for a wrong shape, device or size (32-bit indices).
 
     >>> planes = torch.rand(1, 3, 8, 16, 16, requires_grad=True)
     >>> features = reli3d.sample_triplane(planes, torch.zeros(1, 100, 3))  # (1, 100, 24)

@@ -209,13 +209,11 @@ def write_glb(
 ) -> None:
     """Writes mesh and textures of ``asset`` as a GLB file, completely or not at all; the environment is not written.
 
-    asset: its mesh needs normals, UV and tangents, as returned by :func:`reconstruct` and :func:`read_glb`; for other
-    meshes, :func:`unwrap` adds UV and normals, and :meth:`Mesh.with_tangents` adds tangents.  extras: JSON values for
-    glTF's ``asset.extras``.  double_sided: None: true unless the mesh is watertight.  translation: translation of the
-    glTF node, for objects so far from the origin that float32 vertices would lose precision.  textures: ``png``, or
-    ``webp`` (lossless, smaller, needs a viewer with ``EXT_texture_webp``).  Raises TypeError for a wrong type;
-    ValueError for missing attributes, values that are non-finite or outside [0, 1], non-unit normals, or a file of 4
-    GiB or more; OSError if writing fails.
+    asset: with normals, UV and tangents; :func:`unwrap` and :meth:`Mesh.with_tangents` add them.  extras: JSON for
+    glTF's ``asset.extras``.  double_sided: None: unless watertight.  translation: of the glTF node, for objects so far
+    from the origin that float32 would lose precision.  textures: ``png``, or ``webp`` (lossless, smaller, needs
+    ``EXT_texture_webp``).  Raises TypeError for a wrong type; ValueError for missing attributes, non-finite values or
+    ones outside [0, 1], non-unit normals, or 4 GiB and more; OSError if writing fails.
 
     >>> reli3d.write_glb("object.glb", asset, extras={"license": "CC0-1.0"})
     >>> parts = reli3d.read_glb("object.glb")

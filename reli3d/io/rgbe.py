@@ -129,11 +129,7 @@ def _run_lengths(path, data: bytes, at: int, line: np.ndarray) -> int:
 
 
 def _pixels(path, data: bytes, at: int, line: np.ndarray) -> int:
-    """Decode one scanline of whole pixels, where (1, 1, 1, n) repeats the one before n times; returns the offset.
-
-    Repeats that follow each other are the bytes of one count, the lowest first.  What leads beyond the scanline is
-    ignored, and its first pixel is none of them.
-    """
+    """Decode a scanline of whole pixels; (1, 1, 1, n), low byte first, repeats the one before; returns the offset."""
     length, done, shift = len(line), 0, 0
     while done < length:
         quads = np.frombuffer(data, np.uint8, min(length - done, (len(data) - at) // 4) * 4, at).reshape(-1, 4)

@@ -76,11 +76,7 @@ class _VnInvariant(nn.Module):
 
 
 class _Conditioning(nn.Module):
-    """Attention of a ray to a single conditioning token, as published.
-
-    A softmax over one key is 1, so the result is ``fc_out(value(condition))`` for every ray; query and key exist only
-    for the checkpoint.
-    """
+    """Attention of a ray to a token: a softmax over one key is 1; query and key exist only for the checkpoint."""
 
     def __init__(self, width: int, condition: int):
         super().__init__()

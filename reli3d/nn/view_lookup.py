@@ -64,16 +64,14 @@ def pool_views(
 def fuse_views(
     images: Tensor, pixels: Tensor, camera: Camera, points: Tensor, visible: Tensor, normal: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Blends the views' material predictions at surface ``points (N, 3)`` by visibility and viewing angle.
-
-    Returns the base color logit ``(N, 3)``, features ``(N, 10)`` and the unit normal ``(N, 3)``.
+    """Blends the views' material at ``points (N, 3)``: base color logit ``(N, 3)``, features ``(N, 10)``, unit normal.
 
     pixels: ``(3, V, P, P, 4)``: gain and three shifts; confidence, roughness, metallic, chroma; normal, 0.  The base
     color logit of a view is ``gain * m + chroma * (l - m) + shift`` with the logits ``l`` of the observed color and
-    their mean ``m``.  The blend weight is ``w**2 * exp(confidence)`` with the unnormalized weight ``w`` of
+    their mean ``m``.  The blend weight is ``w**2 * exp(confidence)``; ``w`` and other arguments as in
     :func:`summarize_views`.  Features: roughness, metallic, gain, blended normal minus ``normal``, their cosine,
-    greatest ``w``, confidence, standard deviation of the logit.  Other arguments as in :func:`summarize_views`.  No
-    gradient; :class:`reli3d.nn.local.LocalField` has the differentiable version in torch.
+    greatest ``w``, confidence, standard deviation of the logit.  No gradient; :class:`reli3d.nn.local.LocalField` has
+    the differentiable version in torch.
     """
     check("pixels", pixels, last=4, like=images)
     if pixels.ndim != 5 or pixels.shape[:2] != (3, len(images)) or min(pixels.shape[2:4]) < 2:

@@ -95,11 +95,7 @@ def _rendered(asset: Asset, camera: Camera, scene: RayScene, lights: Sequence[En
 
 
 def _denoised(*renderings: Render) -> list[Tensor]:
-    """Denoises renderings of one camera under several environments by a joint bilateral filter; returns radiances.
-
-    The filter (Petschnigg et al. 2004) runs on the ratio of radiance to base color, guided by normals and alpha, so
-    that edges of the maps are kept.
-    """
+    """Radiances denoised over base color by a joint bilateral filter (Petschnigg et al. 2004)."""
     rendering, count = renderings[0], 3 * len(renderings)
     albedo = (rendering.base_color + SPECULAR_ALBEDO) * rendering.alpha[..., None]
     ratios = [s.radiance / albedo.clamp(min=1e-6) for s in renderings]

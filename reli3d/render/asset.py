@@ -20,14 +20,12 @@ KEPT = 2048  # texels a side up to which lookups are kept: 50 MB
 class TextureSet:
     """Metallic-roughness textures of one mesh: square float32 maps of equal size, with values in [0, 1].
 
-    Row 0 is v = 0 (glTF: v down), texel centers at +0.5.  base_color: ``(T, T, 3)``, linear; files hold sRGB.
-    roughness (perceptual), metallic: ``(T, T)``, ``(T, T, 1)``, or a Python number (no gradient); to optimize one
-    value for the whole map, pass a scalar tensor expanded to ``(T, T)``.  normal: ``(T, T, 3)``, tangent-space unit
-    normals ``n`` encoded as ``n * 0.5 + 0.5``, green along the bitangent; None: flat.  wrap: wrap modes along u and v
-    for UV outside [0, 1], each ``repeat``, ``mirror`` or ``clamp``.  After construction all maps are tensors.
+    Row 0 is v = 0 (glTF: v down), texel centers at +0.5.  base_color: ``(T, T, 3)``, linear.  roughness (perceptual),
+    metallic: ``(T, T)``, ``(T, T, 1)``, or a number (no gradient).  normal: ``(T, T, 3)``, tangent-space normals as ``n
+    / 2 + 0.5``, green along the bitangent; None: flat.  wrap: along u and v, each ``repeat``, ``mirror`` or ``clamp``.
+
     Gradients pass through.  Raises TypeError for a wrong type or dtype, ValueError for a wrong shape, device or wrap
-    mode.  Values are range-checked only when a file is written: in optimization, clamp the maps after each step or use
-    a sigmoid.
+    mode.  Only writers check ranges: clamp optimized maps.
 
     >>> textures = reli3d.TextureSet(torch.full((64, 64, 3), 0.5), roughness=0.4, metallic=0.0)
     >>> asset = reli3d.Asset(mesh, textures)

@@ -56,12 +56,12 @@ def shade_gaussians(points: SurfacePoints, wo: Tensor, light: SphericalGaussians
     """Reflected radiance ``(N, 3)`` of ``points`` towards ``wo`` under ``light``, without shadows; linear Rec. 709.
 
     wo: ``(N, 3)`` unit, or one row for all points.  A point with non-finite inputs gives NaN.  Position and geometric
-    normal are not used.  The material model is in ``reli3d.kernels.bsdf``.  Diffuse term: closed-form cosine integral.
-    Specular term: Wang et al. 2009, with GGX approximated by four Gaussians.
+    normal are not used.  Material model: ``reli3d.kernels.bsdf``.  Diffuse term: closed-form cosine integral.  Specular
+    term: Wang et al. 2009, with GGX approximated by four Gaussians.
 
-    Error against quadrature, for lighting around the mirror direction and viewing angles up to 45 degrees: 6 % at
-    roughness 0.3, 12 % at roughness 0.5.  At roughness 1 or a viewing angle of 70 degrees: 20 to 35 % at the peak and
-    up to a factor of 2 off the peak.  Gradients reach all inputs that are used.
+    Error against quadrature around the mirror direction, at viewing angles up to 45 degrees: 6 % at roughness 0.3, 12 %
+    at 0.5.  At roughness 1 or a viewing angle of 70 degrees: 20 to 35 % at the peak and up to a factor of 2 off the
+    peak.  Gradients reach all inputs used.
     """
     expect("points", points, SurfacePoints)
     normal, n = points.normal, len(points)

@@ -74,10 +74,10 @@ def tangent_normals(mesh: Mesh, face: Tensor, bary: Tensor, normal: Tensor, mapp
 def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: Tensor) -> SurfacePoints:
     """Geometry and material at hits of a mesh, the input of :func:`reli3d.shade`.
 
-    mesh: with ``uv`` if textured.  textures: None: a gray dielectric with base color 0.5, roughness 0.5, metallic 0.
-    face: ``(N,)`` int32, without misses.  bary: ``(N, 2)`` weights of vertices 1 and 2.  The shading normal is the
-    interpolated vertex normal (the geometric normal if ``mesh.normals`` is None), perturbed by the normal map in the
-    frame of ``mesh.tangents`` (of the UV gradients if ``mesh.tangents`` is None).
+    mesh: with ``uv`` if textured.  textures: None: a dielectric with base color and roughness 0.5.  face: ``(N,)``
+    int32, without misses.  bary: ``(N, 2)`` weights of vertices 1 and 2.  The shading normal is the interpolated vertex
+    normal (without ``mesh.normals``: the geometric normal), perturbed by the normal map in the frame of
+    ``mesh.tangents`` (without them: of the UV gradients).
 
     Gradients reach the mesh's arrays, the textures and ``bary``.  Raises TypeError for a wrong type or dtype;
     ValueError for a wrong shape or device, a face index out of range, or textures without ``mesh.uv``.

@@ -1,4 +1,9 @@
-"""Renders assets: primary visibility, materials, direct lighting with shadows, background, subpixel averaging."""
+"""Renders assets: primary visibility, materials, direct lighting with shadows, background, subpixel averaging.
+
+Radiance gradients reach the textures, the environment texels, and the mesh's normals, tangents, colors and UV; they
+reach the vertices only if the mesh has no vertex normals, because shading then uses the face normals.  ``alpha`` has no
+gradient.  The motion of silhouettes and shadow boundaries contributes to no gradient.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -86,25 +91,16 @@ def render_asset(
     scene: RayScene | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Render:
-    """Renders ``asset`` under an environment with direct lighting and shadows.
+    """Renders ``asset``, or several that shadow each other, under an environment with direct lighting and shadows.
 
-    asset: an :class:`Asset`, or a list of assets that shadow each other; an asset without textures is rendered as a
-    dielectric with base color 0.5 and roughness 0.5.  camera: a single camera.  environment: the lighting; if None, the
-    environment of the first asset that has one.  options: sample counts, seed and material model.  supersampling: k for
-    k x k camera rays per pixel, each shaded with the full sample counts.  shadows: whether shadow rays are traced.
-    background: ``transparent``, or ``environment``: composited behind the object; in that case save ``image.radiance``,
-    not ``image.rgba``.  scene: a :class:`RayScene` of the mesh or, for several assets, of all meshes concatenated in
-    list order; None: built here.  progress: called with the completed fraction.
+    Without textures: a dielectric with base color and roughness 0.5.  environment: None: the first of an asset.
+    supersampling: k x k camera rays per pixel, each with all samples.  background: ``transparent`` or ``environment``
+    (then save ``radiance``, not ``rgba``).  scene: of the meshes, concatenated.  progress: called with the completed
+    fraction.
 
-    Hit points (face and barycentric coordinates) and visibility are treated as constant; otherwise the gradients are
-    those of :func:`surface_points` and :func:`shade`.  Radiance gradients reach the textures, the environment texels,
-    and the mesh's normals, tangents, colors and UV; they reach the vertices only if the mesh has no vertex normals,
-    because shading then uses the face normals.  G-buffer gradients reach the textures and the mesh; depth gradients
-    also reach the camera.  ``alpha`` has no gradient.  The motion of silhouettes and shadow boundaries contributes to
-    no gradient; :func:`antialias` adds that of silhouettes.
-
-    Raises TypeError for a wrong type; ValueError if neither ``environment`` nor an asset's environment is given, for an
-    unknown ``background``, if ``camera`` is a batch, or for textures without ``mesh.uv``.
+    Gradients as in :func:`surface_points` and :func:`shade`, at constant hits and visibility; depth's also reach the
+    camera; silhouettes' need :func:`antialias`.  Raises TypeError for a wrong type; ValueError without environment or
+    UV, for a batch of cameras or an unknown background.
 
     >>> camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.5, 3.0]), 0.7, 512, 512)
     >>> image = reli3d.render_asset(asset, camera, reli3d.Environment.constant(torch.ones(3)), supersampling=2)
@@ -258,10 +254,7 @@ def _points(parts: Sequence[Asset], face: Tensor, bary: Tensor) -> SurfacePoints
 
 
 def _band(parts, camera, lights, scene, first, shadows, background, options) -> Iterator[Tensor]:
-    """Premultiplied layers ``(rows, W, C)`` of one band of subpixels: radiance under each environment, then G-buffers.
-
-    With a transparent background rays are traced only in the bounding box of the asset.
-    """
+    """Premultiplied layers ``(rows, W, C)`` of a band of subpixels: radiance under each environment, then G-buffers."""
     whole = (0, 0, camera.width, camera.height)
     left, top, right, bottom = box_of(scene.vertices, camera) if background == "transparent" else whole
     corner = camera.intrinsics.new_tensor([0.0, 0.0, left, top])  # integers: rays are bitwise unchanged

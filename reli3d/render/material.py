@@ -2,6 +2,11 @@
 
 Argument order: ``wo``, the material, then ``wi`` (to evaluate) or ``u`` (to sample ``wi``).  ``alpha`` is the GGX
 width, ``roughness**2``.  The formulas are in ``reli3d.kernels.bsdf``.
+
+Antithetic pairs: lobe ``visible`` with ``u`` and with ``antithetic(u)``, averaged; or, as in ReLi3D, ``visible`` and
+``mirrored`` with the same ``u``, each sample's value times cosine divided by the sum of both lobes' densities at its
+direction, then added.  Directions below the horizon, and those about a mirrored normal that faces away, have value and
+density 0.  Densities have no gradient: detach the directions to differentiate a Monte Carlo estimate.
 """
 
 import torch
@@ -39,12 +44,11 @@ def eval_bsdf(
     """Metallic-roughness BSDF ``(..., 3)`` [1/sr], without the cosine; 0 if ``wo`` or ``wi`` is below the horizon.
 
     wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha: ``(...)`` GGX width,
-    ``roughness**2``.  metallic: ``(...)`` in [0, 1].  All are tensors; leading axes broadcast.  diffuse_model: Fresnel
-    factor of the diffuse term.  ``conserving``: the product of 1 - F for ``wo`` and for ``wi``, with F evaluated at
-    their angles to the surface normal and reduced for rough surfaces; the albedo is at most 1.  ``published``: 1 - F at
-    the half vector, the formula of ReLi3D's shader and of glTF 2.0's appendix B.  Gradients reach all five tensors; the
-    gradient of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless float32, ValueError for a wrong
-    shape or device, or an unknown model.  Source: glTF 2.0, appendix B; GGX of Walter et al. 2007 with Smith's
+    ``roughness**2``.  metallic: ``(...)`` in [0, 1].  Leading axes broadcast.  diffuse_model: ``conserving`` (albedo at
+    most 1) or ``published`` (ReLi3D's shader; glTF 2.0, appendix B), see ``reli3d.kernels.bsdf``.
+
+    Gradients reach all five tensors; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless
+    float32, ValueError for a wrong shape, device or model.  Source: glTF 2.0; GGX of Walter et al. 2007 with Smith's
     height-correlated masking.
 
     >>> up, half = torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.5)
@@ -60,19 +64,14 @@ def eval_bsdf(
 
 
 def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") -> Tensor:
-    """Samples one lobe of the BSDF: unit directions ``wi (..., 3)`` with the density :func:`pdf_bsdf` of that lobe.
+    """Unit directions ``wi (..., 3)`` from one lobe of the BSDF, with the density :func:`pdf_bsdf`.
 
-    wo: ``(..., 3)`` unit, local frame, z > 0; otherwise all directions have density 0.  alpha: tensor ``(...)``, GGX
-    width ``roughness**2``.  u: ``(..., 2)`` uniform in [0, 1).  Leading axes broadcast.  lobe: ``visible`` (``wo``
-    reflected about a sampled visible normal), ``mirrored`` (the visible normal is first rotated by pi around the
-    surface normal; ``wo`` is reflected about the rotated normal) or ``cosine``.  Directions below the horizon, and
-    reflections about a mirrored normal that faces away from ``wo``, have value and density 0.  Two antithetic pairings
-    exist.  (1) ``visible`` with ``u`` and with ``antithetic(u)``: average the two estimates.  (2) As in ReLi3D,
-    ``visible`` and ``mirrored`` with the same ``u``: divide each sample's value times cosine by the sum of both lobes'
-    densities at its direction, then add the two quotients.  Do not use ``mirrored`` alone: it does not reach all
-    directions.  Gradients reach ``wo`` and ``alpha``, but :func:`pdf_bsdf` has none: detach the directions to
-    differentiate a Monte Carlo estimate.  Raises TypeError unless float32, ValueError for a wrong shape or device, or
-    an unknown lobe.  Source: Dupuy and Benyoub 2023.
+    wo: ``(..., 3)`` unit, local frame, z > 0, else density 0.  alpha: ``roughness**2``.  u: ``(..., 2)`` uniform in [0,
+    1).  lobe: ``visible`` (``wo`` reflected about a visible normal), ``mirrored`` (about that normal turned by pi; only
+    with ``visible``, see the module) or ``cosine``.
+
+    Gradients reach ``wo`` and ``alpha``.  Raises TypeError unless float32, ValueError for a wrong shape, device or
+    lobe.  Source: Dupuy and Benyoub 2023.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u).detach()
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi).clamp(min=1e-12)  # 0 below the horizon, where the value is 0 too

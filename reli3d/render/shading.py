@@ -1,4 +1,8 @@
-"""Direct lighting of surface points by multiple importance sampling, with optional shadow rays."""
+"""Direct lighting of surface points by multiple importance sampling, with optional shadow rays.
+
+The gradient of one rendering's squared residual is biased, because value and derivative share the same noise; for an
+unbiased gradient, multiply the residuals of two renderings with different seeds.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -57,20 +61,15 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ShadeOptions:
-    """Options of :func:`shade`: sampling and material model.
+    """Options of :func:`shade`: sampling and material model; raises ValueError for an invalid count or choice.
 
-    samples: :class:`Samples`, or three counts in the same order, each at least 0.  seed: random seed; different seeds
-    give independent noise.  In optimization, change the seed every step.  The gradient of one rendering's squared
-    residual is biased, because value and derivative share the same noise; for an unbiased gradient, multiply the
-    residuals of two renderings with different seeds.  antithetic: pairing of visible-normal samples: ``opposite``
-    (opposite side of the lobe, see :func:`reli3d.antithetic`), ``mirrored`` (about the surface normal, as in ReLi3D) or
-    ``none``.  heuristic: MIS weights, ``balance`` or ``power``.  sequence: ``halton``, with a Cranley-Patterson
-    rotation per point and strategy, or ``random``.  alpha: GGX width of roughness r: ``squared`` (r^2) or, as in
-    ReLi3D, ``linear`` (r).  diffuse_model: ``conserving`` or ``published``, see :func:`reli3d.eval_bsdf`.  clamp: upper
-    limit, per channel, of a sample's contribution ``w * f * L * cos(theta) / p`` before division by its strategy's
-    sample count (w: MIS weight, f: BSDF, L: radiance, theta: angle between the direction and the shading normal, p:
-    density); None: no limit.  check_inputs: raise ValueError for unnormalized directions, materials outside [0, 1] or
-    non-finite values.  Raises ValueError for an invalid count or choice.
+    samples: :class:`Samples`, or its three counts.  seed: gives independent noise; change it in every step of an
+    optimization.  antithetic: pairs of visible-normal samples: ``opposite`` (see :func:`reli3d.antithetic`),
+    ``mirrored`` (as in ReLi3D), ``none``.  heuristic: MIS weights, ``balance`` or ``power``.  sequence: ``halton``,
+    rotated per point and strategy, or ``random``.  alpha: GGX width, ``squared`` roughness or, as in ReLi3D,
+    ``linear``.  diffuse_model: see :func:`reli3d.eval_bsdf`.  clamp: limit per channel of ``w * f * L * cos(theta) /
+    p`` of a sample (w: MIS weight).  check_inputs: ValueError for unnormalized directions, materials outside [0, 1],
+    non-finite values.
 
     >>> fast = reli3d.ShadeOptions(samples=reli3d.Samples(light=4, bsdf=4, cosine=2), seed=1)
     >>> image = reli3d.render_asset(asset, camera, light, options=fast)
@@ -114,16 +113,13 @@ def shade(
 ) -> Tensor:
     """Reflected radiance ``(N, 3)`` of surface points towards ``wo`` under ``environment``; linear Rec. 709.
 
-    points: N points with their material.  wo: ``(N, 3)`` unit, world frame, to the viewer, or one row for all points.
-    Back faces are shaded like front faces.  scene: occluders for shadow rays; None: no shadows.  options: sample
-    counts, seed and material model.  pixels: ``(N,)`` int32, index that seeds each point's samples together with
-    ``options.seed``; None: the row index.  A point with non-finite inputs gives NaN.
+    wo: ``(N, 3)`` unit, world frame, or one row for all points.  Back faces are shaded like front faces.  scene:
+    occluders; None: no shadows.  pixels: ``(N,)`` int32, seeds each point's samples with ``options.seed``; None: the
+    row.  Non-finite inputs give NaN.
 
-    Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``.  Sampled directions,
-    densities, MIS weights and visibility are constants in the backward pass; ``wo``, ``ng`` and ``position`` have no
-    gradient.  Only the component of the normal's gradient that is orthogonal to the normal is meaningful.  Once
-    differentiable.  Bitwise identical for any number of threads.  Raises TypeError for a wrong type or dtype,
-    ValueError for a wrong shape or device.  Source: multiple importance sampling of Veach and Guibas 1995; BSDF:
+    Gradients, once differentiable, reach normal (its orthogonal part counts), base_color, roughness, metallic and the
+    environment's texels, at constant directions, densities, MIS weights and visibility.  Bitwise reproducible.  Raises
+    TypeError for a wrong type or dtype, ValueError for a wrong shape or device.  Source: Veach and Guibas 1995;
     :func:`reli3d.eval_bsdf`.
 
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)

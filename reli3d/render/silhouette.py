@@ -140,14 +140,12 @@ def antialias(
 ) -> Tensor:
     """Antialiases the silhouettes of a mesh in ``image (H, W, C)``, differentiably in the vertices.
 
-    image: float32, any number of channels, sampled at the pixel centers, for instance shaded first hits or a mask.
-    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  camera: a single camera of the image's size.  scene:
-    occluders of the edges; None: built from the mesh.  edges: from :func:`reli3d.render.silhouette.mesh_edges`, for
-    reuse while the faces do not change; None: built here.
+    image: float32, sampled at the pixel centers, for instance shaded first hits or a mask.  vertices: ``(V, 3)``
+    float32.  faces: ``(F, 3)`` int32.  camera: a single one of the image's size.  scene: occluders, None: the mesh.
+    edges: from :func:`reli3d.render.silhouette.mesh_edges`, for reuse.
 
-    Gradients reach image, vertices and camera, and are bitwise identical for any number of CPU threads.  Only
-    visibility silhouettes are handled, not texture edges or intersections of faces.  Raises TypeError for a wrong
-    dtype, ValueError for a wrong shape, an image size that differs from the camera's, or a face index out of range.
+    Gradients reach image, vertices and camera, bitwise reproducibly.  Texture edges and intersections of faces are not
+    handled.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or size, or a face index out of range.
     Source: Laine et al. 2020, section 3.4.
 
     >>> mask = reli3d.RayScene(mesh).intersect(*reli3d.camera_rays(camera)).valid[..., None].float()

@@ -87,9 +87,7 @@ def _linear_of_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
 def _frame(
     rng: np.random.Generator, low: float, high: float, *, stretch: float = 1.0, turned: float = 0.2
 ) -> np.ndarray:
-    """Random pattern frame of ``low`` to ``high`` cycles per unit with permuted axes; with probability ``turned`` a
-    random rotation.
-    """
+    """Random frame of ``low`` to ``high`` cycles per unit, permuted or, with probability ``turned``, rotated."""
     axes = np.eye(3)[rng.permutation(3)]
     if rng.random() < turned:
         axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]

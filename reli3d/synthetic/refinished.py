@@ -54,9 +54,7 @@ def _map_file(folder: Path, name: str) -> Path:
 
 @lru_cache(24)
 def _read_set(folder: Path, side: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Linear base color, (roughness, metallic, 0), and tangent-space normal (OpenGL) of a set, each
-    ``(side, side, 3)``.
-    """
+    """Linear base color, (roughness, metallic, 0), tangent-space normal (OpenGL) of a set, each ``(side, side, 3)``."""
 
     def read(name: str, mode: str) -> Tensor:
         with Image.open(_map_file(folder, name)) as image:

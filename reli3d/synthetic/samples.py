@@ -209,9 +209,7 @@ def random_faces(surface: Surface, count: int, rng: np.random.Generator) -> tupl
 
 
 def _volume(surface: Surface, rng: np.random.Generator) -> dict[str, Tensor]:
-    """Points of the volume with signed distances: half near the surface, with normally distributed offsets of standard
-    deviation 0.01 or 0.05, half uniform in a box slightly larger than the object.
-    """
+    """Points with signed distances: half near the surface (deviation 0.01 or 0.05), half uniform in a larger box."""
     near = surface.points_at(*random_faces(surface, VOLUME_POINTS // 2, rng)).position.numpy()
     near = near + rng.normal(size=near.shape) * rng.choice([0.01, 0.05], (len(near), 1))
     box = surface.vertices.abs().amax(0).numpy() + 0.12

@@ -71,11 +71,7 @@ def losses(model: LocalReconstructor, sample: Sample) -> dict[str, Tensor]:
 
 
 def _shape_terms(field: LocalField, sample: Sample, position: Tensor, normal: Tensor) -> dict[str, Tensor]:
-    """Occupancy in the volume; at surface points, field value zero and the direction of its gradient.
-
-    The gradient is a finite difference over a tetrahedron, so no second derivative of the network is needed.  It is
-    evaluated at perturbed points, since an extracted surface is not exact.
-    """
+    """Occupancy in the volume; near surface points, value zero and direction of the gradient (a finite difference)."""
     softness = field.model.preset.softness
     sdf = field.sdf(sample.points)
     target = (-sample.distance / softness).sigmoid()
@@ -143,10 +139,7 @@ def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
 
 
 def _pixel_terms(pixels: PixelMaps, shown: Tensor, views: TrainingViews, counts: tuple[int, ...]) -> dict[str, Tensor]:
-    """The pyramid's predictions against the ground-truth maps, at pixels that the surface covers completely.
-
-    shown: ``(V, P, P, 3)`` sRGB, the observed colors.  counts: number of views of each object, in order.
-    """
+    """The pyramid's predictions for colors ``shown (V, P, P, 3)`` against the true maps, at pixels covered."""
     valid = views.view_valid
     target = views.view_material[valid]
     color = pixels.base_logit(shown)[valid].sigmoid()
@@ -181,11 +174,7 @@ def _finish(pixels: PixelMaps, views: TrainingViews) -> dict[str, Tensor]:
 
 
 def _light_terms(field: LocalField, sample: Sample) -> dict[str, Tensor]:
-    """Mean absolute differences of log radiance over the sphere and of log irradiance at random normals.
-
-    Both are invariant to a scale per channel, because a darker albedo under brighter lighting gives the same images.
-    ``light_scale`` is the absolute logarithm of that scale.
-    """
+    """Mean absolute differences of log radiance and log irradiance, without a scale per channel, ``light_scale``."""
     log = field.log_light
     count = len(sample.light)
     rows = int((count // 2) ** 0.5)

@@ -33,10 +33,7 @@ def view_distances(c2w: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _looked_at(eyes: Tensor, axes: Tensor) -> Tensor:
-    """The point nearest to all optical axes, regularized towards :func:`meeting_point` for near-parallel axes.
-
-    The prior has 1e-5 of the weight of an axis: axes that differ by a degree determine the point.
-    """
+    """The point nearest to all optical axes, with a prior of 1e-5 of an axis at :func:`meeting_point`."""
     one = torch.eye(3, dtype=axes.dtype, device=axes.device)
     across = one - axes[:, :, None] * axes[:, None]
     right = (across @ eyes[..., None]).mean(0)[:, 0]

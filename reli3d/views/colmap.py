@@ -125,11 +125,7 @@ def _entries(path: Path) -> list[tuple[str, str, list[float], object]]:
 
 
 def _text_images(path: Path) -> Iterator[tuple[str, str, list[float], str]]:
-    """``(name, where, rotation and translation, camera)`` of each image.
-
-    Lines of points are recognized by their form: for an image without points COLMAP writes an empty one, other
-    programs none.
-    """
+    """``(name, where, pose, camera)`` of each image; lines of points, which some programs leave out, by their form."""
     for n, line in _lines(path):
         if _POINTS.fullmatch(line):
             continue

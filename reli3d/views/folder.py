@@ -52,17 +52,13 @@ def load_views(
 ) -> Views:
     """Reads the images of an object folder with cameras and masks, in folder order.
 
-    folder: with cameras in ``transforms.json`` (also ``transforms_train.json`` and the other splits), a COLMAP model,
-    ``cameras_sphere.npz`` or ``poses_bounds.npy``; :mod:`reli3d.capture` estimates missing cameras.  views: number of
-    views, 1 to 16, selected by farthest-point sampling.  first_views: number of views, taken from the beginning.  If
-    neither is given: all views, or 16 selected by farthest-point sampling if there are more.  every: read all views,
-    without limit; :meth:`Views.taken` then selects 16.  masks: folder of masks; None: ``mask_path`` of a frame, alpha,
-    or a folder ``masks`` or ``mask``, in this order.  whole: downsample images above two megapixels to two megapixels
-    instead of cropping them to the object.  remove_background: compute the masks of images that have none with
-    ``rembg`` (``pip install "reli3d[masks]"``), which may download its network.
+    folder: with ``transforms.json`` (or its splits), a COLMAP model, ``cameras_sphere.npz`` or ``poses_bounds.npy``.
+    views: number of views, 1 to 16, by farthest-point sampling, the default above 16.  first_views: the first ones
+    instead.  every: all views; :meth:`Views.taken` selects later.  masks: folder; None: ``mask_path`` of a frame,
+    alpha, or a folder ``masks`` or ``mask``.  whole: downsample images above two megapixels instead of cropping to the
+    object.  remove_background: compute missing masks with ``rembg`` (extra ``masks``, downloads its network).
 
-    Cameras far from the world origin are translated by ``-Views.origin``.  Raises InputError with one line that names
-    file, field, value and fix.
+    Cameras far from the world origin are translated by ``-Views.origin``.  Raises InputError: file, field, value, fix.
 
     >>> views = reli3d.load_views("photos/shoe", views=4)
     >>> notes = views.notes

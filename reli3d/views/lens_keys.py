@@ -197,10 +197,7 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
 
 
 def _spellings(where: str, source: dict, data: dict, size) -> Iterator[tuple[str, Lens, float]]:
-    """``(key, lens, focal length in image widths)`` of each spelling in ``source``, in the order of preference.
-
-    The ratio is NaN where the width is not known.
-    """
+    """``(key, lens, focal length in image widths or NaN)`` of each spelling in ``source``, in order of preference."""
     width = math.nan if size is None else size[0]
     for key in _MATRICES:
         if source.get(key) is not None:

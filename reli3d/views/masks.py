@@ -105,9 +105,7 @@ def _coverage(path: os.PathLike, channel: Image.Image, notes: list[str]) -> Imag
 
 
 def _scaled(channel: Image.Image, grays: list[int], notes: list[str]) -> Image.Image:
-    """``channel`` such that the object is opaque, with a note: where its highest value is below white and frequent, or
-    most of its values lie near it, as those of a codec about a label do.
-    """
+    """``channel`` with the object opaque, and a note, if its highest is below white and most values lie near it."""
     peak, top = grays[-1], _TOP[channel.mode]
     if not 0 < peak < MIN_OPAQUE * top:
         return channel

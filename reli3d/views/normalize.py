@@ -47,16 +47,13 @@ class Hull:
 def normalize(views: Views, mode: str = "auto") -> Similarity:
     """The transform from the frame of the input cameras to the network's frame (no rotation).
 
-    mode ``none``: identity.  ``hull``: the bounding box of the visual hull is centered and its longest side scaled to
-    1, as in training.  ``auto``: the same with ``views.object_box`` if there is one; else the identity if the visual
-    hull lies in the network's cube of half side 0.87, is at least 0.55 long and centered within 0.3 of the origin; else
-    ``hull``.
+    mode ``none``: identity.  ``hull``: the visual hull's box is centered, its longest side scaled to 1, as in
+    training.  ``auto``: the same with ``views.object_box`` if there is one; else the identity if the hull lies in the
+    network's cube of half side 0.87, is at least 0.55 long and centered within 0.3; else ``hull``.
 
-    Captures from one side (all cameras within 90 degrees as seen from the object) do not constrain the depth of the
-    object: the hull is cut at 1.3 times the width of the masks, and the box is aligned with the mean viewing direction,
-    so that the scale does not depend on the frame.  One view (or views from one direction) does not determine scale:
-    the depth is set to the width, at the point of the ray nearest to the origin.  Raises InputError if no point lies
-    inside all masks.
+    With all cameras within 90 degrees, the hull is cut at 1.3 times the width of the masks and the box aligned with the
+    mean viewing direction.  From one direction, the depth is the width, nearest to the origin.  Raises InputError if no
+    point lies inside all masks.
     """
     if mode not in ("auto", "none", "hull"):
         raise ValueError(f"mode: expected auto, none or hull, got {mode!r}")
