@@ -114,20 +114,6 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     return Texels(face, bary, distance == 0.0)
 
 
-def coverage(mesh: Mesh, size: int) -> Tensor:
-    """Number of faces whose interior contains each texel center, ``(size, size)`` uint8, at most 255."""
-    corners = _corners(mesh, size)
-    hits = torch.zeros(size, size, dtype=torch.uint8, device=corners.device)
-    if len(mesh.faces):
-        tile = TILE_TEXELS[corners.device.type]
-        lower, upper = torch.aminmax(corners, dim=1)
-        tiles = _tiles(corners, lower, upper, size, tile)
-        _bridge.launch(
-            kernels.coverage_kernel, (-(-size // tile)) ** 2, [tiles, hits], corners.device, slice_min=TILES_MIN
-        )
-    return hits
-
-
 def interpolate(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
     """Positions and unit normals ``(N, 3)`` at the valid texels with flat int64 indices ``index (N,)``.
 

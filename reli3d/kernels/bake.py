@@ -148,39 +148,6 @@ def texels_kernel(
 
 
 @wp.kernel
-def coverage_kernel(
-    start: int,
-    # in
-    tiles: Tiles,
-    # out
-    hits: wp.array2d[wp.uint8],
-):
-    """Number of faces, 255 at most, whose interior holds each center of tile ``i``."""
-    i = start + wp.tid()
-    box = tile_box(tiles, i)
-    for y in range(box[1], box[3] + 1):
-        for x in range(box[0], box[2] + 1):
-            hits[y, x] = wp.uint8(0)
-    for s in range(tiles.face_start[i], tiles.face_start[i + 1]):
-        f = tiles.face_list[s]
-        a = tiles.corners[f, 0]
-        b = tiles.corners[f, 1] - a
-        c = tiles.corners[f, 2] - a
-        turn = wp.float32(1.0)
-        if cross2(b, c) < 0.0:
-            turn = -1.0
-        over = centers(a, b, c, box)
-        for y in range(over[1], over[3] + 1):
-            for x in range(over[0], over[2] + 1):
-                p = wp.vec2(float(x) + 0.5, float(y) + 0.5) - a
-                w0 = turn * cross2(c - b, p - b) - cross2_error(c - b, p - b)
-                w1 = turn * cross2(p, c) - cross2_error(p, c)
-                w2 = turn * cross2(b, p) - cross2_error(b, p)
-                if wp.min(w0, wp.min(w1, w2)) > 0.0:
-                    hits[y, x] = wp.uint8(wp.min(int(hits[y, x]) + 1, 255))
-
-
-@wp.kernel
 def nearest_row_kernel(
     start: int,
     # in

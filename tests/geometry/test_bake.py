@@ -8,7 +8,7 @@ import torch
 import trimesh
 from scipy import ndimage
 
-from reli3d.geometry.bake import bake, coverage, dilate, interpolate, nearest_valid, rasterize_texels
+from reli3d.geometry.bake import bake, dilate, interpolate, nearest_valid, rasterize_texels
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.tangents import decode_normals, encode_normals
 from reli3d.geometry.uv import unwrap
@@ -81,15 +81,6 @@ def test_texels_match_brute_force(device):
     )
     point = (q[got.face.cpu().numpy().ravel()[ring]] * full[ring][:, :, None]).sum(1)
     np.testing.assert_allclose(np.linalg.norm(point - p[ring][:, 0], axis=1), distance[ring], atol=1e-4)
-
-
-def test_coverage_counts_sheets_and_no_shared_edge(device):
-    corners = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 1, 2]]).int()
-    mesh = Mesh(torch.zeros(4, 3), faces, uv=corners).to(device)
-    hits = coverage(mesh, 32).cpu()
-    y, x = torch.meshgrid(torch.arange(32), torch.arange(32), indexing="ij")
-    assert torch.equal(hits, torch.where(x > y, 2, torch.where(x < y, 1, 0)).to(torch.uint8))  # the diagonal is an edge
 
 
 def test_bilinear_lookup_reads_the_surface_only(sphere):

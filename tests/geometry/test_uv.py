@@ -7,12 +7,12 @@ import trimesh
 
 from bench.surface import field
 from reli3d.geometry import charts, uv
-from reli3d.geometry.bake import coverage, nearest_valid
+from reli3d.geometry.bake import nearest_valid
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.topology import face_neighbors
 from reli3d.geometry.uv import guard_band, source_vertices, unwrap, unwrap_xatlas
-from tests.support.meshes import QUICK, SLOW, loaded, mesh_from, mesh_of
+from tests.support.meshes import QUICK, SLOW, coverage, loaded, mesh_from, mesh_of
 
 slow = pytest.mark.slow
 

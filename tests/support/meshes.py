@@ -44,6 +44,20 @@ def loaded(path) -> Mesh:
     return mesh_from(shape)
 
 
+def coverage(mesh: Mesh, size: int) -> torch.Tensor:
+    """Number of faces whose interior contains each center of ``size x size`` texels; float64."""
+    q = mesh.uv.double().numpy()[mesh.faces.numpy()] * size
+    low = np.ceil(q.min(1) - 0.5).astype(int).clip(0, size)
+    counts = (np.floor(q.max(1) - 0.5).astype(int).clip(-1, size - 1) - low + 1).clip(0)
+    face = np.repeat(np.arange(len(q)), counts.prod(1))
+    k = np.arange(len(face)) - np.repeat(np.cumsum(counts.prod(1)) - counts.prod(1), counts.prod(1))
+    x, y = low[face, 0] + k % counts[face, 0], low[face, 1] + k // counts[face, 0]
+    d = q[face] - np.stack([x, y], -1)[:, None] - 0.5
+    sides = np.stack([d[:, j, 0] * d[:, j - 1, 1] - d[:, j, 1] * d[:, j - 1, 0] for j in range(3)])
+    inside = (sides.min(0) > 1e-9) | (sides.max(0) < -1e-9)
+    return torch.from_numpy(np.bincount((y * size + x)[inside], minlength=size * size).reshape(size, size))
+
+
 def sheet(n=9):
     """A bumpy sheet of ``n x n`` vertices, and which of them lie on its border."""
     x, y = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")

@@ -70,8 +70,7 @@ def texels(vertices):
     along = bake.bake(mesh, 64, lambda position, normal, tangent: tangent, texels=found, tangents=True)
     colors = uniform(n, 5, seed=7).to(vertices)
     of_vertices = bake.bake(mesh, 64, lambda position, normal, value: value, texels=found, values=colors)["value"]
-    covered = bake.coverage(mesh, 64)
-    return found.face, found.bary, near, square, maps["value"], along["value"], covered, tangents, of_vertices
+    return found.face, found.bary, near, square, maps["value"], along["value"], tangents, of_vertices
 
 
 def seen_from(points, normal):
