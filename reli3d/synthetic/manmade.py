@@ -131,11 +131,9 @@ def device(a: Assembly) -> None:
         rows, cols = int(rng.integers(1, 5)), int(rng.integers(2, 7))
         size, low = min(0.7 * w / cols, 0.3 * h / rows) * 0.8, u(-0.45, -0.3) * h + 0.08 * h
         keys = a.random_part("plastic", "accent", "rubber")
-        key = (
-            p.box((size, size, 0.06), 0.15 * size)
-            if rng.random() < 0.6
-            else p.cylinder(size / 2, 0.06, bevel=0.01, segments=16).rotate((90, 0, 0))
-        )
+        key = p.cylinder(size / 2, 0.06, bevel=0.01, segments=16).rotate((90, 0, 0))
+        if rng.random() < 0.6:
+            key = p.box((size, size, 0.06), 0.15 * size)
         for i in range(rows):
             for j in range(cols):
                 a.add(key, keys, ((j - (cols - 1) / 2) * size * 1.25, low + i * size * 1.25, front))
@@ -147,18 +145,9 @@ def device(a: Assembly) -> None:
         else:
             a.add(knob.rotate((90, 0, 0)), trim, (u(-0.4, 0.4) * w, u(-0.4, 0.4) * h, front + tall * 0.4))
     if rng.random() < 0.3:  # carrying handle
-        x, y = 0.4 * w, h / 2
-        path = p.curve(
-            [
-                [-x, y - 0.03, 0],
-                [-x * 0.9, y + 0.18, 0],
-                [0, y + u(0.2, 0.3), 0],
-                [x * 0.9, y + 0.18, 0],
-                [x, y - 0.03, 0],
-            ],
-            24,
-        )
-        a.add(p.tube(path, u(0.02, 0.04), segments=10), trim)
+        rise = h / 2 + np.array([-0.03, 0.18, u(0.2, 0.3), 0.18, -0.03])
+        path = np.stack([0.4 * w * np.array([-1, -0.9, 0, 0.9, 1]), rise, np.zeros(5)], -1)
+        a.add(p.tube(p.curve(path, 24), u(0.02, 0.04), segments=10), trim)
     if rng.random() < 0.15:
         antenna = p.cylinder(0.012, u(0.4, 0.8), segments=8).rotate((0, 0, u(-30, 30)))
         a.add(antenna, trim, (0.4 * w * rng.choice([-1, 1]), h * 0.7, -0.2 * d))

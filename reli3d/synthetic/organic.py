@@ -113,11 +113,7 @@ def creature(a: Assembly) -> None:
     """Quadruped or bird: body, neck, head with snout, ears or horns, eyes, tail; sometimes on a plinth."""
     rng, u = a.rng, a.rng.uniform
     statue = rng.random() < 0.35
-    skin = a.part(
-        str(rng.choice(["stone", "metal", "ceramic", "wood"]))
-        if statue
-        else str(rng.choice(["skin", "plastic", "fabric"]))
-    )
+    skin = a.random_part(*("stone metal ceramic wood" if statue else "skin plastic fabric").split())
     other = skin if statue or rng.random() < 0.5 else a.part("skin")
     long, tall, fat = u(0.3, 0.6), u(0.12, 0.5), u(0.08, 0.2)
     f = Field((-0.75, -0.02, -0.32), (0.95, 1.25, 0.32))
@@ -145,9 +141,8 @@ def creature(a: Assembly) -> None:
         f.limb(ear, end, size * 0.3, size * u(0.08, 0.3), blend=0.02, label=1)
         if bird:
             f.ball((-0.05, y, s * fat), (long * 0.55, fat * 0.6, 0.06), blend=0.04, label=1)
-    tail = p.curve(
-        back + np.cumsum(np.concatenate([np.zeros((1, 3)), u([-0.2, -0.2, -0.1], [-0.02, 0.2, 0.1], (3, 3))]), 0), 6
-    )
+    moves = np.concatenate([np.zeros((1, 3)), u([-0.2, -0.2, -0.1], [-0.02, 0.2, 0.1], (3, 3))])
+    tail = p.curve(back + np.cumsum(moves, 0), 6)
     for k in range(5):
         f.limb(tail[k], tail[k + 1], thick * (1.1 - 0.15 * k), thick * (1 - 0.15 * k), blend=0.03)
     if rng.random() < 0.3:
@@ -159,12 +154,10 @@ def creature(a: Assembly) -> None:
             a.add(p.ellipsoid(np.full(3, size * 0.2), 12), eye, head + np.array([0.62, 0.35, s * 0.62]) * size)
     if statue or rng.random() < 0.1:
         base = a.random_part("wood", "stone", "metal")
-        plinth = (
-            p.box((long + 0.4, u(0.05, 0.2), 0.5), 0.02)
-            if rng.random() < 0.5
-            else p.cylinder(0.36, u(0.05, 0.15), bevel=0.02).scale((1.1, 1, 0.8))
-        )
-        a.add(plinth, base, (0, -0.02, 0))
+        if rng.random() < 0.5:
+            a.add(p.box((long + 0.4, u(0.05, 0.2), 0.5), 0.02), base, (0, -0.02, 0))
+        else:
+            a.add(p.cylinder(0.36, u(0.05, 0.15), bevel=0.02).scale((1.1, 1, 0.8)), base, (0, -0.02, 0))
 
 
 def figure(a: Assembly) -> None:
@@ -210,9 +203,8 @@ def figure(a: Assembly) -> None:
         a.keep_inside(p.box((2, 2, 2)).translate((0, hip + 1.12, 0)), skin)
         a.add(p.cylinder(0.16, 0.18, top=0.09, bevel=0.01), a.part("stone"), (0, hip + 0.04, 0))
     elif plain or rng.random() < 0.2:
-        a.add(
-            p.box((0.5, u(0.04, 0.3), 0.45), 0.02), a.part("stone" if rng.random() < 0.5 else "wood"), (0, -0.03, 0.03)
-        )
+        base = p.box((0.5, u(0.04, 0.3), 0.45), 0.02)
+        a.add(base, a.part("stone" if rng.random() < 0.5 else "wood"), (0, -0.03, 0.03))
     elif seated:
         a.add(p.box((0.36, hip * 0.85, 0.34), 0.02), a.part("wood"), (0, hip * 0.42, -0.02))
 
@@ -265,9 +257,8 @@ def fruit(a: Assembly) -> None:
     a.warp(move, 0.09)
     if rng.random() < 0.7:
         top = tall * (1 - 0.4 * dent) + bend * 0
-        path = p.curve(
-            [[bend / 4, top - 0.08, 0], [bend / 4, top + 0.08, 0], [bend / 4 + u(-0.1, 0.1), top + u(0.1, 0.3), 0]], 8
-        )
+        x = bend / 4
+        path = p.curve([[x, top - 0.08, 0], [x, top + 0.08, 0], [x + u(-0.1, 0.1), top + u(0.1, 0.3), 0]], 8)
         a.add(p.tube(path, np.linspace(0.045, 0.03, 8), segments=8), stalk)
     if rng.random() < 0.3:
         leaf = a.part("skin")

@@ -1,5 +1,7 @@
 """Families of vessels, lamps and containers.  ``manmade.py`` defines a family."""
 
+import itertools
+
 import numpy as np
 
 from reli3d.synthetic import primitives as p
@@ -43,16 +45,8 @@ def vessel(a: Assembly) -> None:
         high = max(high, low + 0.25 * height)
         at = lambda y: float(np.interp(y, fine[:, 1], fine[:, 0]))  # noqa: E731
         out = wide + u(0.12, 0.5)
-        path = p.curve(
-            [
-                [at(low) * 0.96, low],
-                [(out + at(low)) / 2, low - 0.02],
-                [out, (low + high) / 2],
-                [(out + at(high)) / 2, high + 0.03],
-                [at(high) * 0.96, high],
-            ],
-            20,
-        )
+        reach = [at(low) * 0.96, (out + at(low)) / 2, out, (out + at(high)) / 2, at(high) * 0.96]
+        path = p.curve(np.stack([reach, [low, low - 0.02, (low + high) / 2, high + 0.03, high]], -1), 20)
         thick = u(0.03, 0.075) * max(wide, 0.5)
         grip = p.tube(np.concatenate([path, np.zeros((20, 1))], 1), thick, segments=10).scale((1, 1, u(0.8, 1.8)))
         handle = body if rng.random() < 0.6 else a.random_part("wood", "metal", "plastic")
@@ -75,11 +69,8 @@ def _lid(a: Assembly, radius: float, height: float, segments: int) -> None:
     lid = a.random_part("accent", "metal", "wood", "plastic")
     if rng.random() < 0.6:  # screw cap or cork
         tall = radius * u(0.4, 1.4)
-        a.add(
-            p.cylinder(radius * u(0.9, 1.15), tall, bevel=0.04 * radius, segments=segments),
-            lid,
-            (0, height + 0.45 * tall, 0),
-        )
+        cap = p.cylinder(radius * u(0.9, 1.15), tall, bevel=0.04 * radius, segments=segments)
+        a.add(cap, lid, (0, height + 0.45 * tall, 0))
     else:
         a.add(p.ellipsoid((radius * 1.03, radius * u(0.2, 0.5), radius * 1.03)), lid, (0, height, 0))
         a.add(p.ellipsoid(np.full(3, radius * u(0.12, 0.25))), lid, (0, height + radius * 0.5, 0))
@@ -92,16 +83,11 @@ def lamp(a: Assembly) -> None:
     if rng.random() < 0.5:
         shade = a.random_part("fabric", "paint", "ceramic")
         tall, foot = u(0.6, 1.2), u(0.2, 0.4)
-        knots = p.curve(
-            np.stack(
-                [np.append(foot * np.exp(rng.normal(-0.8, 0.5, 4)).clip(0.1, 0.9), 0.04), np.linspace(0, tall, 5)], -1
-            ),
-            24,
-        )
+        stem = np.append(foot * np.exp(rng.normal(-0.8, 0.5, 4)).clip(0.1, 0.9), 0.04)
+        knots = p.curve(np.stack([stem, np.linspace(0, tall, 5)], -1), 24)
         a.add(p.cylinder(foot, u(0.03, 0.1), bevel=0.015), frame)
-        a.add(
-            p.solid_of_profile(knots[:, 0].clip(0.025), knots[:, 1]), a.part("ceramic") if rng.random() < 0.5 else frame
-        )
+        part = a.part("ceramic") if rng.random() < 0.5 else frame
+        a.add(p.solid_of_profile(knots[:, 0].clip(0.025), knots[:, 1]), part)
         wide, top, high = u(0.35, 0.6), u(0.15, 0.45), u(0.3, 0.6)
         ring = np.array([[wide, 0], [top, high], [top - 0.02, high], [wide - 0.02, 0]])
         a.add(p.lathe(ring, int(rng.choice([8, 40]))), shade, (0, tall - 0.25 * high, 0))
@@ -115,9 +101,8 @@ def lamp(a: Assembly) -> None:
     posts = max(sides, 4) if sides < 32 else int(rng.integers(4, 9))
     a.copy_turned(p.cylinder(0.022, tall, segments=8).translate((radius, tall / 2, 0)), frame, posts)
     glass = a.random_part("ceramic", "accent", "paint")
-    a.add(
-        p.cylinder(radius * u(0.55, 0.9), tall, segments=32 if rng.random() < 0.5 else sides), glass, (0, tall / 2, 0)
-    )
+    pane = p.cylinder(radius * u(0.55, 0.9), tall, segments=32 if rng.random() < 0.5 else sides)
+    a.add(pane, glass, (0, tall / 2, 0))
     if rng.random() < 0.8:
         ring = p.torus(0.14, 0.018, segments=24).rotate((90, 0, 0))
         a.add(ring, frame, (0, tall + 0.32, 0))
@@ -147,16 +132,10 @@ def container(a: Assembly) -> None:
     a.add(p.box((w, h, d), float(rng.choice([0.0, 0.02, 0.06, 0.15]))), body)
     if kind < 0.7:  # frame of planks along the edges
         t = u(0.05, 0.12)
-        for axis in range(3):
-            for s in (-1, 1):
-                for r in (-1, 1):
-                    size, at = np.full(3, t), np.zeros(3)
-                    size[axis] = (w, h, d)[axis] + t * 0.6
-                    at[(axis + 1) % 3], at[(axis + 2) % 3] = (
-                        s * (w, h, d)[(axis + 1) % 3] / 2,
-                        r * (w, h, d)[(axis + 2) % 3] / 2,
-                    )
-                    a.add(p.box(size, 0.1 * t), frame, at)
+        for axis, s, r in itertools.product(range(3), (-1, 1), (-1, 1)):
+            size = np.full(3, t)
+            size[axis] = (w, h, d)[axis] + t * 0.6
+            a.add(p.box(size, 0.1 * t), frame, np.roll([0, s, r], axis) * (w, h, d) / 2)
         if rng.random() < 0.4:
             brace = p.box((np.hypot(w, h) * 0.92, t, d + t * 0.7)).rotate((0, 0, np.degrees(np.arctan2(h, w))))
             a.add(brace, frame)
