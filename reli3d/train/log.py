@@ -80,9 +80,8 @@ def summary_writer() -> type:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        raise InputError(
-            "--tensorboard", "expected the package tensorboard, got none; pip install tensorboard"
-        ) from None
+        problem = "expected the package tensorboard, got none"
+        raise InputError("--tensorboard", f"{problem}; pip install tensorboard") from None
     return SummaryWriter
 
 
