@@ -19,19 +19,9 @@ from reli3d.output import results
 from reli3d.pipeline import FolderOptions, Progress, ReconstructOptions, reconstruct_folder
 
 STAGES = (
-    "reading",
-    "normalize",
-    "prepare",
-    "symmetry",
-    "network",
-    "surface",
-    "textures",
-    "light",
-    "frame",
-    "refine",
-    "preview",
-    "writing",
-)
+    "reading", "normalize", "prepare", "symmetry", "network", "surface", "textures", "light", "frame", "refine",
+    "preview", "writing",
+)  # fmt: skip
 
 
 class FolderJob:

@@ -6,6 +6,7 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from reli3d.cli.exit_codes import Parser, check_ranges, command, extra
 from reli3d.errors import InputError
@@ -78,14 +79,8 @@ def main(argv: list[str] | None = None) -> int:
     args = _completed(parser().parse_args(argv))
     _check(args)
     files = [str(path) for path in render_files(args)]
-    record = {
-        "files": files,
-        "frames": args.frames,
-        "size": args.size,
-        "samples": list(args.samples),
-        "supersampling": args.supersampling,
-    }
-    print(json.dumps(record) if args.json else "\n".join(files))
+    record = {name: getattr(args, name) for name in ("frames", "size", "samples", "supersampling")}
+    print(json.dumps({"files": files, **record}) if args.json else "\n".join(files))
     return 0
 
 
@@ -163,6 +158,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     args.output.mkdir(parents=True, exist_ok=True)
     written, animation = [], []
     options = ShadeOptions(samples=tuple(args.samples), seed=args.seed, diffuse_model=args.diffuse_model)
+    shown: Any = {"scene": scene, "shadows": not args.no_shadows}
     bar = tqdm(total=args.frames, unit="frame", file=sys.stderr, disable=None)
     for frame in range(args.frames):
         turn = 2.0 * math.pi * frame / args.frames
@@ -172,28 +168,13 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         eye = center + distance * torch.tensor(offset, device=device)
         camera = Camera.from_fov(look_at(eye, center, up), math.radians(args.fov), args.size, args.size)
         if args.plan is not None and frame == 0:
-            plan = plan_render(
-                parts,
-                camera,
-                environment,
-                total=args.plan,
-                options=options,
-                relative=args.format != "exr",
-                scene=scene,
-                shadows=not args.no_shadows,
-            )
+            relative = args.format != "exr"
+            plan = plan_render(parts, camera, environment, total=args.plan, relative=relative, options=options, **shown)
             options = replace(options, samples=plan.samples, antithetic="none")
             print("reli3d-render: samples by strategy", *plan.samples, file=sys.stderr)
-        image = render_asset(
-            parts,
-            camera,
-            environment if args.turn == "camera" else environment.rotated(turn),
-            scene=scene,
-            shadows=not args.no_shadows,
-            options=replace(options, seed=args.seed + frame),
-            supersampling=args.supersampling,
-            background=args.background,
-        )
+        turned = environment if args.turn == "camera" else environment.rotated(turn)
+        sampling: Any = {"options": replace(options, seed=args.seed + frame), "supersampling": args.supersampling}
+        image = render_asset(parts, camera, turned, background=args.background, **sampling, **shown)
         still = args.file if args.format in STILL else None
         name = args.glb.stem if still is None else still.stem
         stem = args.output / (name if args.frames == 1 else f"{name}_{frame:04d}")
@@ -235,17 +216,9 @@ def _animate(path: Path, images: list, kind: str) -> None:
 
         return write_bytes(path, mp4_bytes(images, RATE))
     # disposal 2: clear to transparent before each frame
-    options = {"lossless": False} if kind == "webp" else {"disposal": 2}
-    return _save(
-        path,
-        images[0],
-        format=kind.upper(),
-        save_all=True,
-        append_images=images[1:],
-        duration=round(1000 / RATE),
-        loop=0,
-        **options,
-    )
+    options: Any = {"lossless": False} if kind == "webp" else {"disposal": 2}
+    options |= {"save_all": True, "append_images": images[1:], "duration": round(1000 / RATE), "loop": 0}
+    return _save(path, images[0], format=kind.upper(), **options)
 
 
 def _save(path: Path, image_file, **options) -> None:

@@ -43,20 +43,12 @@ def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Came
     lowest = _lowest(sdf)
     residual = sdf.new_empty(views, height // STRIDE, width // STRIDE)
     cameras = [v.detach().contiguous() for v in (camera.c2w, camera.intrinsics)]
-    launch(
-        kernels.residual_kernel,
-        residual.numel(),
-        [sdf, lowest, distance, *cameras, radius, DEPTH, FIELD_MAX, STRIDE, residual],
-        sdf.device,
-    )
+    inputs = [sdf, lowest, distance, *cameras, radius, DEPTH, FIELD_MAX, STRIDE, residual]
+    launch(kernels.residual_kernel, residual.numel(), inputs, sdf.device)
     residual = max_pool2d(residual, 3, 1, 1)  # dilated by a ray, so that interpolation reaches the silhouette's edge
     lowered = torch.empty_like(sdf)
-    launch(
-        kernels.lower_kernel,
-        sdf.numel(),
-        [sdf, bound, residual, *cameras, radius, FIELD_MAX, STRIDE, lowered],
-        sdf.device,
-    )
+    inputs = [sdf, bound, residual, *cameras, radius, FIELD_MAX, STRIDE, lowered]
+    launch(kernels.lower_kernel, sdf.numel(), inputs, sdf.device)
     return lowered
 
 

@@ -27,18 +27,9 @@ def mask_distance(masks: Tensor) -> Tensor:
     if views and not (bool((masks >= 0).all()) and bool((masks <= 1).all())):
         raise ValueError("masks: expected values in [0, 1], got others")
     distance = torch.empty_like(masks)
-    launch(
-        kernels.mask_distance_kernel,
-        masks.numel(),
-        [
-            masks,
-            *_nearest_crossing(masks),
-            *_nearest_crossing(masks.transpose(1, 2).contiguous()),
-            math.hypot(height, width),
-            distance,
-        ],
-        masks.device,
-    )
+    crossings = *_nearest_crossing(masks), *_nearest_crossing(masks.transpose(1, 2).contiguous())
+    inputs = [masks, *crossings, math.hypot(height, width), distance]
+    launch(kernels.mask_distance_kernel, masks.numel(), inputs, masks.device)
     return distance
 
 

@@ -194,11 +194,8 @@ def topology_of(sdf: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topol
         sdf = torch.nn.functional.pad(sdf, (1,) * 6, value=1.0)
     case, crossed = _classify(sdf)
     cells = case.view(-1).nonzero().squeeze(1)
-    i, j, k = (
-        cells // (sdf.shape[1] * sdf.shape[2]) - pad,
-        cells // sdf.shape[2] % sdf.shape[1] - pad,
-        cells % sdf.shape[2] - pad,
-    )
+    _, y, z = sdf.shape
+    i, j, k = cells // (y * z) - pad, cells // z % y - pad, cells % z - pad
     rows = (i * size[1] + j) * size[2] + k
     if pad:
         real = (i >= 0) & (j >= 0) & (k >= 0) & (i < size[0]) & (j < size[1]) & (k < size[2])

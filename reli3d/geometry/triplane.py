@@ -79,11 +79,9 @@ class _SampleTriplane(torch.autograd.Function):
         points, packed, order, edges, _ = ctx.saved_tensors
         channels = ctx.shape[2]
         g = g_out.reshape(*points.shape[:2], 3, channels)
-        g = (
-            torch.nn.functional.pad(g, (0, -channels % BLOCK_CHANNELS)).contiguous()
-            if channels % BLOCK_CHANNELS
-            else g.contiguous()
-        )
+        if channels % BLOCK_CHANNELS:
+            g = torch.nn.functional.pad(g, (0, -channels % BLOCK_CHANNELS))
+        g = g.contiguous()
         g_planes = _planes_adjoint(points, g, order, edges, ctx.shape).to(ctx.dtype) if order is not None else None
         g_points = _points_adjoint(packed, points, g) if packed is not None else None
         return g_planes, g_points
@@ -97,11 +95,8 @@ def sizes_of(points: int, height: int, width: int, blocks: int) -> kernels.Sizes
 def packed_planes(planes: Tensor) -> Tensor:
     """``(B, 3, H, W, C')`` float32, C' the next multiple of 8; no copy if the planes already have this layout."""
     packed = planes.detach().permute(0, 1, 3, 4, 2)
-    packed = (
-        torch.nn.functional.pad(packed, (0, -planes.shape[2] % BLOCK_CHANNELS))
-        if planes.shape[2] % BLOCK_CHANNELS
-        else packed
-    )
+    if planes.shape[2] % BLOCK_CHANNELS:
+        packed = torch.nn.functional.pad(packed, (0, -planes.shape[2] % BLOCK_CHANNELS))
     return packed.to(torch.float32).contiguous()
 
 

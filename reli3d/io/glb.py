@@ -189,12 +189,8 @@ def _geometry(mesh) -> tuple[dict, list[bytes]]:
     faces = np.ascontiguousarray(mesh.faces.cpu().numpy(), dtype="<u4")
     accessors.append({"bufferView": len(arrays), "componentType": UINT, "count": faces.size, "type": "SCALAR"})
     chunks.append(faces.tobytes())
-    primitive = {
-        "attributes": {name: k for k, name in enumerate(arrays)},
-        "indices": len(arrays),
-        "material": 0,
-        "mode": 4,
-    }
+    attributes = {name: k for k, name in enumerate(arrays)}
+    primitive = {"attributes": attributes, "indices": len(arrays), "material": 0, "mode": 4}
     return {"accessors": accessors, "meshes": [{"name": "object", "primitives": [primitive]}]}, chunks
 
 

@@ -264,12 +264,8 @@ class Materials:
                 warnings.simplefilter("ignore")
                 with Image.open(io.BytesIO(data), formats=FORMATS) as image:
                     if not 0 < math.prod(image.size) <= self.left:
-                        self.document.fail(
-                            where,
-                            f"expected at most {self.left} more pixels in all",
-                            image.size,
-                            "use smaller textures",
-                        )
+                        expected = f"expected at most {self.left} more pixels in all"
+                        self.document.fail(where, expected, image.size, "use smaller textures")
                     self.left -= math.prod(image.size)
                     if image.mode.startswith("I"):  # 16 bit gray
                         gray = np.asarray(image).astype(np.float32)[..., None] / 65535.0

@@ -143,10 +143,8 @@ def _alternatives(views: Views):
 def _verdict(views: Views, hull: Hull, filled: list[float]) -> str:
     border = min(float((torch.cat([m[0], m[-1], m[:, 0], m[:, -1]]) > 0.5).float().mean()) for m in views.masks)
     if border > INVERTED_BORDER:
-        return (
-            f"suspect: the masks look inverted (they cover {100 * border:.0f} % of the image border); "
-            "make the object white, the background black"
-        )
+        text = f"suspect: the masks look inverted (they cover {100 * border:.0f} % of the image border)"
+        return f"{text}; make the object white, the background black"
     if len(views) == 1:
         return _single(views, hull)
     given = sum(filled) / len(filled)
@@ -156,47 +154,33 @@ def _verdict(views: Views, hull: Hull, filled: list[float]) -> str:
         if score >= max(best, MIN_FILLED):
             cause, fix, best = what, how, score
     if cause:
-        return (
-            f"suspect: {cause}; {fix} (the hull then fills {100 * best:.0f} % of the masks instead of "
-            f"{100 * given:.0f} %)"
-        )
+        text = f"suspect: {cause}"
+        return f"{text}; {fix} (the hull then fills {100 * best:.0f} % of the masks instead of {100 * given:.0f} %)"
     if min(filled) >= MIN_FILLED:
         low, high = hull.box()
         size = " x ".join(f"{v:.3g}" for v in (high - low).tolist())
-        return (
-            f"cameras agree: the visual hull fills at least {100 * min(filled):.0f} % of every mask; its box is {size} "
-            f"about {_triple((low + high) / 2)}; {_scaling(views)}"
-        )
+        text = f"cameras agree: the visual hull fills at least {100 * min(filled):.0f} % of every mask"
+        return f"{text}; its box is {size} about {_triple((low + high) / 2)}; {_scaling(views)}"
     for i in range(len(views) if len(views) > 2 else 0):
         if min(agreement(views.select([j for j in range(len(views)) if j != i]))[1]) >= MIN_FILLED:
-            return (
-                f"suspect: view {i} ({printable(views.names[i])}) does not agree with the others, which agree without "
-                "it; check its camera and mask, or leave it out"
-            )
+            text = f"suspect: view {i} ({printable(views.names[i])}) does not agree with the others"
+            return f"{text}, which agree without it; check its camera and mask, or leave it out"
     eyes = views.c2w[:, :3, 3].double()
     if float((eyes - eyes[0]).norm(dim=-1).max()) <= EYE_RESOLUTION * float(eyes.norm(dim=-1).max()):
-        return (
-            "suspect: all cameras stand in one point: the views show one side of the object, and no depth; give the "
-            "positions of the cameras, or one view"
-        )
+        text = "suspect: all cameras stand in one point: the views show one side of the object, and no depth"
+        return f"{text}; give the positions of the cameras, or one view"
     if len(hull.points) == 0:
-        return (
-            "suspect: no point lies inside all masks (the visual hull is empty): the cameras do not look at a common "
-            "object, or the masks show different things"
-        )
-    return (
-        f"suspect: the visual hull fills only {100 * min(filled):.0f} % of a mask: cameras or masks are inaccurate, or "
-        "the object moved; look at the plot of the rig"
-    )
+        text = "suspect: no point lies inside all masks (the visual hull is empty)"
+        return f"{text}: the cameras do not look at a common object, or the masks show different things"
+    text = f"suspect: the visual hull fills only {100 * min(filled):.0f} % of a mask"
+    return f"{text}: cameras or masks are inaccurate, or the object moved; look at the plot of the rig"
 
 
 def _single(views: Views, hull: Hull) -> str:
     pose = views.c2w[0].double().cpu()
     if float(pose[:3, 3] @ pose[:3, 2]) < 0:  # positive where the origin lies before an OpenGL camera
-        return (
-            "suspect: the camera looks away from the origin: its axes may be flipped (OpenCV given, OpenGL expected), "
-            "or its matrix world-to-camera; one view leaves it open"
-        )
+        text = "suspect: the camera looks away from the origin: its axes may be flipped (OpenCV given, OpenGL expected)"
+        return f"{text}, or its matrix world-to-camera; one view leaves it open"
     if len(hull.points) == 0:
         return "suspect: no point lies inside the mask; check the field of view and the mask"
     return f"one view: nothing to compare it with; the object is taken to be as deep as wide; {_scaling(views)}"

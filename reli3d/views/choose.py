@@ -75,8 +75,6 @@ def spread_notes(c2w: Tensor) -> list[str]:
         )
     widest = float(angle.max())
     if len(c2w) > 1 and widest < NARROW_BASELINE_RAD:
-        notes.append(
-            f"narrow baseline: all views lie within {math.degrees(widest):.1f} degrees; depth and "
-            "unobserved sides are poorly constrained, add views from all around"
-        )
+        text = f"narrow baseline: all views lie within {math.degrees(widest):.1f} degrees"
+        notes.append(f"{text}; depth and unobserved sides are poorly constrained, add views from all around")
     return notes

@@ -80,10 +80,8 @@ def read_transforms(path: Path) -> tuple[list[Frame], list[str]]:
     ranked = sorted(range(len(frames)), key=order.__getitem__)
     found = [_frame(path, i, frames[i], data) for i in ranked]
     if data.get("applied_transform") is not None:
-        notes.append(
-            f"{path.name}: applied_transform recorded by nerfstudio is not undone; the mesh is in the "
-            "frame of transform_matrix"
-        )
+        text = f"{path.name}: applied_transform recorded by nerfstudio is not undone"
+        notes.append(f"{text}; the mesh is in the frame of transform_matrix")
     return found, notes
 
 

@@ -16,15 +16,8 @@ from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.views import Chooser, ObjectViews, Samples, sample_views
 
 STORED_TENSORS = (
-    "images",
-    "c2w",
-    "intrinsics",
-    "view_material",
-    "view_normal",
-    "view_depth",
-    "environment",
-    "finish_known",
-)
+    "images", "c2w", "intrinsics", "view_material", "view_normal", "view_depth", "environment", "finish_known",
+)  # fmt: skip
 
 
 def to_tensors(views: ObjectViews) -> dict[str, Tensor]:
