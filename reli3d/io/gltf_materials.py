@@ -88,9 +88,8 @@ class Materials:
         layouts = {slot.layout for slot in material.slots if slot is not None}
         channels = {layout.channel for layout in layouts}
         if len(channels) > 1:
-            self.document.fail(
-                f"materials[{index}]", "expected one UV channel for all textures", sorted(channels), "bake to one"
-            )
+            expected = "expected one UV channel for all textures"
+            self.document.fail(f"materials[{index}]", expected, sorted(channels), "bake to one")
         uv = coordinates(next(iter(channels), 0))
         if not layouts:
             return self._kept(index, material), uv
@@ -157,23 +156,17 @@ class Materials:
     def _make(self, material: _Material, maps: list[Tensor | None], size: int, wrap: tuple[str, str]) -> TextureSet:
         white = torch.ones(size, size, 4, dtype=torch.float32, device="cpu")
         color, parameters = (white if m is None else m for m in maps[:2])
-        color = srgb_to_linear(color[..., :3]) * torch.tensor(material.color, dtype=torch.float32, device="cpu").clamp(
-            0.0, 1.0
-        )
+        color = srgb_to_linear(color[..., :3]) * _factor(material.color).clamp(0.0, 1.0)
         if material.specular is None:
             rough = parameters[..., 1] * min(max(material.roughness, 0.0), 1.0)
             metal = parameters[..., 2] * min(max(material.metallic, 0.0), 1.0)
         else:
-            specular = srgb_to_linear(parameters[..., :3]) * torch.tensor(
-                material.specular, dtype=torch.float32, device="cpu"
-            ).clamp(0.0, 1.0)
+            specular = srgb_to_linear(parameters[..., :3]) * _factor(material.specular).clamp(0.0, 1.0)
             rough = 1.0 - parameters[..., 3] * min(max(material.glossiness, 0.0), 1.0)
             color, metal = metallic_from_specular(color, specular)
         normal = None if maps[2] is None else maps[2][..., :3]
         if normal is not None and material.normal_scale != 1.0:
-            mapped = (normal * 2.0 - 1.0) * torch.tensor(
-                [material.normal_scale, material.normal_scale, 1.0], dtype=torch.float32, device="cpu"
-            )
+            mapped = (normal * 2.0 - 1.0) * _factor([material.normal_scale, material.normal_scale, 1.0])
             normal = torch.nn.functional.normalize(mapped, dim=-1, eps=1e-6) * 0.5 + 0.5
         return TextureSet(color.clamp(0.0, 1.0), rough.contiguous(), metal.contiguous(), normal, wrap=wrap)
 
@@ -225,10 +218,8 @@ class Materials:
         if "KHR_texture_transform" in extensions:
             where = f"{field}.extensions.KHR_texture_transform"
             change = get(extensions, "KHR_texture_transform", dict, where)
-            (x, y), (sx, sy) = (
-                document.numbers(change, name, 2, f"{where}.{name}", default)
-                for name, default in (("offset", [0, 0]), ("scale", [1, 1]))
-            )
+            x, y = document.numbers(change, "offset", 2, f"{where}.offset", [0, 0])
+            sx, sy = document.numbers(change, "scale", 2, f"{where}.scale", [1, 1])
             turn = get(change, "rotation", float, f"{where}.rotation", 0.0)
             c, s = math.cos(turn), math.sin(turn)
             transform = (c * sx, s * sy, x, -s * sx, c * sy, y)  # counter-clockwise as seen, where v is down
@@ -303,7 +294,10 @@ def _square(image: Tensor, size: int) -> Tensor:
     """``(size, size, C)`` by bilinear interpolation, texel centers at +0.5."""
     if image.shape[:2] == (size, size):
         return image
-    resized = torch.nn.functional.interpolate(
-        image.permute(2, 0, 1)[None], (size, size), mode="bilinear", align_corners=False
-    )
+    planes = image.permute(2, 0, 1)[None]
+    resized = torch.nn.functional.interpolate(planes, (size, size), mode="bilinear", align_corners=False)
     return resized[0].permute(1, 2, 0).contiguous()
+
+
+def _factor(values: list[float]) -> Tensor:
+    return torch.tensor(values, dtype=torch.float32, device="cpu")

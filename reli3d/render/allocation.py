@@ -105,9 +105,8 @@ def _pilot_points(values: list[Tensor], environment, scene, options: ShadeOption
     """Rows of the pilot's points and their weights in the mean over all points, both ``(P,)``."""
     n, device, seed = len(values[0]), values[0].device, options.seed
     if n <= PILOT_POINTS:
-        return torch.arange(n, device=device, dtype=torch.int64), torch.full(
-            (n,), 1.0 / n, dtype=torch.float64, device=device
-        )
+        even = torch.full((n,), 1.0 / n, dtype=torch.float64, device=device)
+        return torch.arange(n, device=device, dtype=torch.int64), even
     rows = spread_rows(n, min(n, FIRST_PASS_POINTS), seed).to(device)
     first = _draw([v[rows] for v in values], environment, 1, scene, replace(options, seed=seed + 1))
     square = first[0].square().sum((1, 2))

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from reli3d.geometry.camera import Camera, camera_rays, project
 from reli3d.geometry.distance import signed_distance
@@ -72,10 +73,11 @@ class ObjectSurface:
     def points_at(self, face: Tensor, bary: Tensor) -> SurfacePoints:
         weights = torch.stack([1 - bary.sum(-1), bary[:, 0], bary[:, 1]], -1)[..., None]
         corners = self.vertices[self.faces[face].long()]
-        ng = torch.nn.functional.normalize(
-            torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1
+        across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        ng, normal = (
+            functional.normalize(across, dim=-1),
+            functional.normalize((self.corner_normals[face] * weights).sum(1), dim=-1),
         )
-        normal = torch.nn.functional.normalize((self.corner_normals[face] * weights).sum(1), dim=-1)
         position = (corners * weights).sum(1)
         base, rough, metal, bump = self.shape.material(position.numpy(), normal.numpy(), self.part[face].numpy())
         as_float = lambda x: torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)  # noqa: E731
@@ -131,13 +133,11 @@ def render_sample(
     exposure, images, pixels, pixel_radiance = 0.0, [], [], []
     maps: dict[str, list[Tensor]] = {"view_material": [], "view_normal": [], "view_depth": []}
     for k in range(views):
-        image, seen, points, wo, radiance = _render(
-            surface, cameras[k].scaled(fine), environment, int(rng.integers(1 << 30))
-        )
+        seed = int(rng.integers(1 << 30))
+        image, seen, points, wo, radiance = _render(surface, cameras[k].scaled(fine), environment, seed)
         if k == 0:
-            exposure = (
-                EXPOSURE_TARGET / max(float(radiance.mean(-1).quantile(0.9)), 1e-3) * float(np.exp(rng.normal(0, 0.25)))
-            )
+            bright = max(float(radiance.mean(-1).quantile(0.9)), 1e-3)
+            exposure = EXPOSURE_TARGET / bright * float(np.exp(rng.normal(0, 0.25)))
         alpha = _coverage(surface.scene, cameras[k], fine + 1)
         image = pooled_pixels((image * exposure).clamp(0, 4), size, fine).clamp(0, 1)  # sensor saturation
         encoded = torch.cat([linear_to_srgb(image), alpha[..., None]], -1)
@@ -149,9 +149,8 @@ def render_sample(
         pixel_radiance.append((radiance[pick] * exposure).clamp(max=64.0))
     sample.update(images=torch.stack(images), c2w=c2w, intrinsics=cameras.intrinsics)
     sample.update({name: torch.stack(values) for name, values in maps.items()})
-    pooled = torch.nn.functional.interpolate(
-        (environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area"
-    )
+    exposed = (environment.radiance * exposure).permute(2, 0, 1)[None]
+    pooled = functional.interpolate(exposed, (32, 64), mode="area")
     # stored with -Z at the horizontal center, the format of samples since version 0.1
     sample["environment"] = quarter_turn(pooled[0].permute(1, 2, 0), 1).clamp(max=6e4).half()
     if not views_only:
@@ -164,19 +163,13 @@ def _view_maps(points: SurfacePoints, seen: Tensor, c2w: Tensor, size: int, fine
     """Ground-truth maps of one view from the ``points`` at the hits of the rays ``seen (N,)``."""
     rays = (size * fine) ** 2
     depth = -((points.position - c2w[:3, 3]) @ c2w[:3, 2])
-    values = [
-        points.base_color.clamp(0, 1),
-        points.roughness[:, None],
-        points.metallic[:, None],
-        points.normal,
-        depth[:, None],
-        torch.ones_like(depth)[:, None],
-    ]
+    finish, last = torch.stack([points.roughness, points.metallic], 1), torch.stack([depth, torch.ones_like(depth)], 1)
+    values = [points.base_color.clamp(0, 1), finish, points.normal, last]
     dense = torch.zeros(rays, 10).index_copy_(0, seen, torch.cat(values, -1))
     base, rest, normal, depth, hit = pooled_pixels(dense, size, fine).split([3, 2, 3, 1, 1], -1)
     fraction = hit.clamp(min=0.5 / fine**2)
     material = torch.cat([linear_to_srgb((base / fraction).clamp(0, 1)), rest / fraction], -1)
-    normal = torch.nn.functional.normalize(normal, dim=-1)
+    normal = functional.normalize(normal, dim=-1)
     whole = hit > 0.5
     return {
         "view_material": (material * whole * 255 + 0.5).to(torch.uint8),
@@ -188,14 +181,14 @@ def _view_maps(points: SurfacePoints, seen: Tensor, c2w: Tensor, size: int, fine
 def pooled_pixels(rays: Tensor, size: int, fine: int = FINE) -> Tensor:
     """Means ``(S, S, C)`` over the ``fine**2`` rays of each pixel, of values ``(rays, C)``."""
     image = rays.reshape(1, size * fine, size * fine, -1).permute(0, 3, 1, 2)
-    return torch.nn.functional.avg_pool2d(image, fine)[0].permute(1, 2, 0)
+    return functional.avg_pool2d(image, fine)[0].permute(1, 2, 0)
 
 
 def _coverage(scene: RayScene, camera: Camera, grid: int) -> Tensor:
     """Antialiased alpha ``(S, S)``: fraction of ``grid**2`` subpixel rays that hit."""
     origins, directions = camera_rays(camera.scaled(grid))
     hit = scene.occluded(origins, directions).float()
-    return torch.nn.functional.avg_pool2d(hit[None, None], grid)[0, 0]
+    return functional.avg_pool2d(hit[None, None], grid)[0, 0]
 
 
 def random_faces(surface: Surface, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
@@ -213,9 +206,8 @@ def _volume(surface: Surface, rng: np.random.Generator) -> dict[str, Tensor]:
     near = surface.points_at(*random_faces(surface, VOLUME_POINTS // 2, rng)).position.numpy()
     near = near + rng.normal(size=near.shape) * rng.choice([0.01, 0.05], (len(near), 1))
     box = surface.vertices.abs().amax(0).numpy() + 0.12
-    points = torch.as_tensor(
-        np.concatenate([near, rng.uniform(-box, box, (VOLUME_POINTS // 2, 3))]), dtype=torch.float32
-    )
+    anywhere = rng.uniform(-box, box, (VOLUME_POINTS // 2, 3))
+    points = torch.as_tensor(np.concatenate([near, anywhere]), dtype=torch.float32)
     points = points.half().float()  # distances of the points as stored, in half precision
     return {"points": points.half(), "distance": surface.distance(points).half()}
 
@@ -223,9 +215,8 @@ def _volume(surface: Surface, rng: np.random.Generator) -> dict[str, Tensor]:
 def _surface_points(surface: Surface, cameras: Camera, rng: np.random.Generator) -> dict[str, Tensor]:
     points = surface.points_at(*random_faces(surface, SURFACE_POINTS, rng))
     visible = visible_from(surface.scene, points.position, points.ng, cameras)
-    encoded = torch.cat(
-        [linear_to_srgb(points.base_color.clamp(0, 1)), points.roughness[:, None], points.metallic[:, None]], -1
-    )
+    finish = torch.stack([points.roughness, points.metallic], 1)
+    encoded = torch.cat([linear_to_srgb(points.base_color.clamp(0, 1)), finish], -1)
     return {
         "surface": torch.stack([points.position, points.ng, points.normal], 1).half(),
         "material": (encoded * 255 + 0.5).to(torch.uint8),

@@ -31,12 +31,12 @@ def random_turn(rng: np.random.Generator) -> Tensor:
     a = rng.uniform(0, 2 * np.pi)
     yaw = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
     if rng.random() < OTHER_UP_PROBABILITY:
-        up = [
-            np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
-            np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
-            np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]]),
-        ][rng.integers(3)]
-        yaw = up @ yaw
+        ups = (
+            [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+            [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+            [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+        )
+        yaw = np.array(ups[rng.integers(3)]) @ yaw
     return torch.as_tensor(yaw, dtype=torch.float32)
 
 

@@ -35,9 +35,8 @@ def progress(options: Options, step: int, seconds: float) -> float:
 def rate_at(options: Options, step: int, done: float) -> float:
     """Learning rate: linear warm-up times a cosine from ``rate`` to ``rate * final_rate``."""
     cosine = 0.5 * (1 + math.cos(math.pi * done))
-    return (
-        options.rate * min(1.0, (step + 1) / options.warmup) * (options.final_rate + (1 - options.final_rate) * cosine)
-    )
+    rate = options.rate * min(1.0, (step + 1) / options.warmup)
+    return rate * (options.final_rate + (1 - options.final_rate) * cosine)
 
 
 def parameter_groups(stage: Stage, weight_decay: float) -> list[dict]:

@@ -102,10 +102,8 @@ def reduction(path: Path, finest: int) -> int:
 def read_views_reduced(path: Path, factor: int, device: torch.device | str = "cpu") -> TrainingViews:
     """All views of a sample, reduced by ``factor``, on ``device``."""
     with safe_open(path, "pt", device=str(device)) as file:
-        images, material, normal, depth, c2w, intrinsics = (
-            file.get_tensor(name).float()
-            for name in ("images", "view_material", "view_normal", "view_depth", "c2w", "intrinsics")
-        )
+        names = "images", "view_material", "view_normal", "view_depth", "c2w", "intrinsics"
+        images, material, normal, depth, c2w, intrinsics = (file.get_tensor(name).float() for name in names)
         known = finish_known(file)
     images = functional.avg_pool2d(images.permute(0, 3, 1, 2) / 255, factor).permute(0, 2, 3, 1).contiguous()
     valid = (depth > 0).float()[:, None]

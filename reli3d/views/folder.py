@@ -5,6 +5,7 @@ Supported: ``transforms.json`` (object folders as published, Blender, nerfstudio
 object is separated from the background by the images' alpha, by ``mask_path``, or by files in a folder ``masks``.
 """
 
+import contextlib
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -68,11 +69,9 @@ def load_views(
             raise InputError(name, f"expected 1 to {MAX_VIEWS}, got {value!r}; give a number in that range")
     if views is not None and first_views is not None:
         raise InputError("views", "expected views or first_views, got both; give one of them")
-    root = Path(folder)
-    try:
+    root, is_folder = Path(folder), False
+    with contextlib.suppress(OSError, ValueError):
         is_folder = root.is_dir()
-    except (OSError, ValueError):
-        is_folder = False
     if not is_folder:
         raise no_cameras(root)
     if masks is not None and not Path(masks).is_dir():
@@ -154,11 +153,8 @@ def _check_poses(frames: list[Frame]) -> None:
     for frame in frames:
         other = first.setdefault(os.path.realpath(frame.image), frame)
         if not np.allclose(other.c2w, frame.c2w):
-            raise InputError(
-                frame.where,
-                f"pose: expected one for each image, got another for {shown(frame.name)} than {other.where} has "
-                "for the same file; remove one of them",
-            )
+            got = f"another for {shown(frame.name)} than {other.where} has for the same file"
+            raise InputError(frame.where, f"pose: expected one for each image, got {got}; remove one of them")
 
 
 def _origin(frames: list[Frame], folder) -> tuple[tuple[float, float, float], list[str]]:
@@ -282,11 +278,9 @@ def _mask(
     if remover is not None:
         return remover.mask(bitmap)
     got = "alpha that is opaque everywhere" if bitmap.mode == "RGBA" else "no alpha"
-    raise InputError(
-        frame.image,
-        f"expected alpha or a foreground mask, got {got}; save RGBA images, put white-on-black masks of the same names "
-        "(and sub-folders) into a folder 'masks', or give --remove-background",
-    )
+    fix = "save RGBA images, put white-on-black masks of the same names (and sub-folders) into a folder 'masks'"
+    problem = f"expected alpha or a foreground mask, got {got}"
+    raise InputError(frame.image, f"{problem}; {fix}, or give --remove-background")
 
 
 def _existing(root: Path, path: Path, index: FolderIndex) -> Path | None:

@@ -87,11 +87,9 @@ def check_keys(where: str, values: dict) -> None:
             problem = f"{key}: expected 0 or none, as it is not read, got {shown(value)}"
             raise InputError(where, f"{problem}; undistort the images first")
         elif _LENS.fullmatch(word) and not _words(value):
-            raise InputError(
-                where,
-                f"{key}: expected fl_x in pixels, camera_angle_x in radians or a 3x3 matrix intrinsics, got a key of "
-                f"the lens that is not read, {shown(value)}; write one of these and remove it",
-            )
+            expected = "fl_x in pixels, camera_angle_x in radians or a 3x3 matrix intrinsics"
+            problem = f"{key}: expected {expected}, got a key of the lens that is not read, {shown(value)}"
+            raise InputError(where, f"{problem}; write one of these and remove it")
 
     for key, entry in _inner(values):
         for name, value in entry.items():
@@ -122,11 +120,9 @@ def _check_inner(where: str, values: dict) -> None:
     for key, entry in _inner(values):
         for name in map(str, entry):
             if name in _READ or _LENS.fullmatch(_word(name)):
-                raise InputError(
-                    where,
-                    f"{key}: expected the lens in the frame or the file, got {shown(name)} within {key}, which is not "
-                    "read; write it into the object that has transform_matrix",
-                )
+                problem = f"{key}: expected the lens in the frame or the file, got {shown(name)} within {key}"
+                fix = "which is not read; write it into the object that has transform_matrix"
+                raise InputError(where, f"{problem}, {fix}")
 
 
 def _word(text: str) -> str:
@@ -209,14 +205,10 @@ def _spellings(where: str, source: dict, data: dict, size) -> Iterator[tuple[str
     if source.get("focal_length") is not None:
         sensor = source.get("sensor_width", data.get("sensor_width"))
         if sensor is None:
-            raise InputError(
-                where,
-                f"focal_length: expected sensor_width with it, got {shown(source['focal_length'])} of an unknown "
-                "unit; write fl_x in pixels",
-            )
-        ratio = number(where, "focal_length", source["focal_length"], 0, 1e9) / number(
-            where, "sensor_width", sensor, 0, 1e9
-        )
+            got = f"{shown(source['focal_length'])} of an unknown unit"
+            raise InputError(where, f"focal_length: expected sensor_width with it, got {got}; write fl_x in pixels")
+        focal = number(where, "focal_length", source["focal_length"], 0, 1e9)
+        ratio = focal / number(where, "sensor_width", sensor, 0, 1e9)
         yield "focal_length", Lens(fov=(2 * math.atan(0.5 / ratio), math.nan)), ratio
 
 
@@ -230,9 +222,7 @@ def _widths(fov: float) -> float:
 
 
 def _size(where: str, frame: dict, data: dict, found) -> tuple[int, int] | None:
-    sides = []
-    for keys in _SIDES:
-        sides.append(next((v for v in (found(key, 0) for key in keys) if v is not None), None))
+    sides = [next((v for v in (found(key, 0) for key in keys) if v is not None), None) for keys in _SIDES]
     w, h = sides
     if any(side is not None and side < 1 for side in sides):
         raise InputError(where, f"w, h: expected at least 1 pixel, got {w} x {h}; correct the camera file")

@@ -50,10 +50,8 @@ def _capture(source: Path, place: Path, got: str, target: Path | None = None) ->
     out = base.with_name(f"{base.stem if base.is_file() else base.name}-object")
     if not (target or source).is_absolute():
         out = Path(os.path.relpath(out))
-    return InputError(
-        source,
-        f"expected a folder with cameras, got {got} without; run: reli3d capture {_quoted(place)} {_quoted(out)}",
-    )
+    command = f"reli3d capture {_quoted(place)} {_quoted(out)}"
+    return InputError(source, f"expected a folder with cameras, got {got} without; run: {command}")
 
 
 def _quoted(path: Path) -> str:

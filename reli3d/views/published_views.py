@@ -97,11 +97,5 @@ def placement_notes(views: Views) -> tuple[str, ...]:
         placed = normalize(views, "auto").is_identity()
     except InputError:  # masks that do not meet
         placed = False
-    return (
-        ()
-        if placed
-        else (
-            "poses go in as stored, but the object does not sit in the network's cube of half side "
-            "0.87 about the origin; try --normalize auto",
-        )
-    )
+    text = "poses go in as stored, but the object does not sit in the network's cube of half side 0.87 about the origin"
+    return () if placed else (f"{text}; try --normalize auto",)

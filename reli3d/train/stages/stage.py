@@ -50,10 +50,8 @@ class PaperStage(Stage):
         if not 1 <= max_views <= 16:
             raise ValueError(f"max_views: expected 1 to 16, got {max_views}")
         self.name, self.weights = config.name, vars(config.weights)
-        self.settings = {
-            **{"steps": config.steps, "batch": config.batch, "rate": config.rate, "final_rate": 0.1},
-            **{"weight_decay": 0.01, "clip": 1.0},
-        }
+        self.settings = {"steps": config.steps, "batch": config.batch, "rate": config.rate}
+        self.settings |= {"final_rate": 0.1, "weight_decay": 0.01, "clip": 1.0}
         self.model, self.config, self.sources = model, config, sources
         self.seed, self.max_views, self.background, self.bfloat16 = seed, max_views, background, bfloat16
         self.distance = perceptual(distance)
@@ -138,11 +136,9 @@ class PaperStage(Stage):
 
 def no_surface(where: object) -> InputError:
     """The error for a network that predicts no surface."""
-    return InputError(
-        where,
-        f"expected a network that predicts a surface, got none for {CHECKED} training objects; start from a longer "
-        f"--stage volume ({TINY['volume'].steps} steps by default), whose log has the fraction with a surface",
-    )
+    fix = f"start from a longer --stage volume ({TINY['volume'].steps} steps by default)"
+    problem = f"expected a network that predicts a surface, got none for {CHECKED} training objects"
+    return InputError(where, f"{problem}; {fix}, whose log has the fraction with a surface")
 
 
 def averaged(model: Reconstructor, average: dict[str, Tensor]) -> Reconstructor:
