@@ -11,20 +11,12 @@ from reli3d.io.files import file_size
 
 # Axes and dtype of each tensor of :mod:`reli3d.synthetic.samples`; equal letters must have equal sizes.
 TENSORS = {
-    "images": ("V S S 4", "U8"),
-    "c2w": ("V 4 4", "F32"),
-    "intrinsics": ("V 4", "F32"),
-    "environment": ("32 64 3", "F16"),
-    "points": ("P 3", "F16"),
-    "distance": ("P", "F16"),
-    "surface": ("N 3 3", "F16"),
-    "material": ("N 5", "U8"),
-    "visible": ("N V", "U8"),
-    "view_material": ("V S S 5", "U8"),
-    "view_normal": ("V S S 3", "I8"),
-    "view_depth": ("V S S", "F16"),
+    "images": ("V S S 4", "U8"), "c2w": ("V 4 4", "F32"), "intrinsics": ("V 4", "F32"),
+    "environment": ("32 64 3", "F16"), "points": ("P 3", "F16"), "distance": ("P", "F16"),
+    "surface": ("N 3 3", "F16"), "material": ("N 5", "U8"), "visible": ("N V", "U8"),
+    "view_material": ("V S S 5", "U8"), "view_normal": ("V S S 3", "I8"), "view_depth": ("V S S", "F16"),
     "finish_known": ("V", "U8"),
-}
+}  # fmt: skip
 POINT_TENSORS = ("points", "distance", "surface", "material", "visible")  # absent from samples with views only
 OPTIONAL = ("finish_known",)  # not in samples of version 0.3, whose finish is taken as known
 
