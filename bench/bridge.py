@@ -11,10 +11,8 @@ wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=na
 @wp.kernel
 def square_kernel(
     start: int,
-    # in
     x: wp.array[float],
-    # out
-    y: wp.array[float],
+    y: wp.array[float],  # out
 ):
     i = start + wp.tid()
     y[i] = x[i] * x[i]

@@ -14,15 +14,13 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=
 @wp.kernel
 def pilot_kernel(
     start: int,
-    # in
     points: Points,
     light: Light,
     plan: Plan,
-    # out
-    origins: wp.array2d[wp.vec3],
-    directions: wp.array2d[wp.vec3],
-    values: wp.array2d[wp.vec3],
-    densities: wp.array2d[wp.vec3],
+    origins: wp.array2d[wp.vec3],  # out
+    directions: wp.array2d[wp.vec3],  # out
+    values: wp.array2d[wp.vec3],  # out
+    densities: wp.array2d[wp.vec3],  # out
 ):
     """Each sample's shadow ray, its value over q, and the densities of environment, visible normals and cosine over q.
 

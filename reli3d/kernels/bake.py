@@ -69,7 +69,6 @@ def centers(a: wp.vec2, b: wp.vec2, c: wp.vec2, box: wp.vec4i) -> wp.vec4i:
 @wp.kernel
 def texels_kernel(
     start: int,
-    # in
     tiles: Tiles,
     segment_start: wp.array[wp.int32],
     segment_list: wp.array[wp.int32],
@@ -77,9 +76,8 @@ def texels_kernel(
     reach: float,
     # scratch
     distance: wp.array2d[float],
-    # out
-    face: wp.array2d[wp.int32],
-    bary: wp.array2d[wp.vec2],
+    face: wp.array2d[wp.int32],  # out
+    bary: wp.array2d[wp.vec2],  # out
 ):
     """Fill tile ``i``: the first face over a texel's center; else the nearest border segment within ``reach`` texels.
 
@@ -150,11 +148,9 @@ def texels_kernel(
 @wp.kernel
 def nearest_row_kernel(
     start: int,
-    # in
     valid: wp.array2d[wp.uint8],
     strip: int,
-    # out
-    row: wp.array2d[wp.int32],
+    row: wp.array2d[wp.int32],  # out
 ):
     """Row of the nearest valid texel of the same column, the upper of two; ``-NO_SITE_ROWS`` without one.
 
@@ -186,14 +182,12 @@ def nearest_row_kernel(
 @wp.kernel
 def nearest_texel_kernel(
     start: int,
-    # in
     row: wp.array2d[wp.int32],
     # scratch
     site: wp.array2d[wp.int32],
     border: wp.array2d[float],
-    # out
-    source: wp.array2d[wp.int32],
-    square: wp.array2d[float],
+    source: wp.array2d[wp.int32],  # out
+    square: wp.array2d[float],  # out
 ):
     """Flat index and squared distance of the nearest valid texel for every texel of row ``i``; -1 and inf without one.
 

@@ -85,15 +85,13 @@ def pdf_lobes(facet: Facet, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
 @wp.kernel
 def eval_bsdf_kernel(
     start: int,
-    # in
     wo: wp.array[wp.vec3],
     wi: wp.array[wp.vec3],
     base_color: wp.array[wp.vec3],
     alpha: wp.array[float],
     metallic: wp.array[float],
     conserving: int,
-    # out
-    value: wp.array[wp.vec3],
+    value: wp.array[wp.vec3],  # out
 ):
     i = start + wp.tid()
     value[i] = wp.vec3(0.0, 0.0, 0.0)
@@ -106,12 +104,10 @@ def eval_bsdf_kernel(
 @wp.kernel(enable_backward=False)
 def pdf_lobes_kernel(
     start: int,
-    # in
     wo: wp.array[wp.vec3],
     wi: wp.array[wp.vec3],
     alpha: wp.array[float],
-    # out
-    pdf: wp.array[wp.vec3],
+    pdf: wp.array[wp.vec3],  # out
 ):
     i = start + wp.tid()
     pdf[i] = wp.vec3(0.0, 0.0, 0.0)

@@ -51,12 +51,10 @@ def overlap(corners: wp.array2d[wp.vec2], i: int, j: int, slack: float) -> bool:
 @wp.kernel
 def overlaps_kernel(
     start: int,
-    # in
     bvh: wp.uint64, boxes: wp.array[wp.int32], query: wp.array[wp.int32],
     corners: wp.array2d[wp.vec2], chart: wp.array[wp.int32], slack: float,
     offset: wp.array[wp.int64], emit: int,
-    # out
-    count: wp.array[wp.int32], partner: wp.array[wp.int32],
+    count: wp.array[wp.int32], partner: wp.array[wp.int32],  # out
 ):  # fmt: skip
     """Count (``emit`` 0) or list (1, from ``offset[i]``) the faces of the same chart that overlap face ``query[i]``.
 
@@ -86,13 +84,11 @@ def overlaps_kernel(
 @wp.kernel
 def split_serial_kernel(
     start: int,
-    # in
     neighbors: wp.array2d[wp.int32], chart: wp.array[wp.int32], seeds: wp.array[wp.int32],
     offset: wp.array[wp.int64], count: wp.array[wp.int32], partner: wp.array[wp.int32], first: int,
     # scratch
     queue: wp.array[wp.int32],
-    # out
-    owner: wp.array[wp.int32],
+    owner: wp.array[wp.int32],  # out
 ):  # fmt: skip
     """Grow connected charts without overlap, breadth first, from ``seeds`` in order; they are numbered from ``first``.
 
@@ -126,11 +122,9 @@ def split_serial_kernel(
 @wp.kernel
 def outline_kernel(
     start: int,
-    # in
     edge_start: wp.array[wp.int32], edges: wp.array2d[wp.vec2], column_start: wp.array[wp.int32],
     scale: float, margin: float,
-    # out
-    bottom: wp.array[wp.int32], top: wp.array[wp.int32],
+    bottom: wp.array[wp.int32], top: wp.array[wp.int32],  # out
 ):  # fmt: skip
     """Lowest and highest cell that chart ``i`` or its margin touches in each of its columns.
 
@@ -169,13 +163,11 @@ def outline_kernel(
 @wp.kernel
 def pack_serial_kernel(
     start: int,
-    # in
     order: wp.array[wp.int32], column_start: wp.array[wp.int32], bottom: wp.array[wp.int32],
     top: wp.array[wp.int32], floor_height: int,
     # scratch
     horizon: wp.array[wp.int32],
-    # out
-    place: wp.array2d[wp.int32], height: wp.array[wp.int32],
+    place: wp.array2d[wp.int32], height: wp.array[wp.int32],  # out
 ):  # fmt: skip
     """Drop charts one after the other onto the horizon, each where it comes to rest lowest; leftmost among equals.
 
@@ -248,12 +240,12 @@ def smallest_box(extent: vec8d) -> wp.float64:
 @wp.kernel
 def cuts_kernel(
     start: int,
-    # in
     along: wp.array[vec8d],  # (P,) border points of the charts, one chart after the other, along the directions
     begin: wp.array[wp.int32],  # (C + 1,) of the charts' points
-    # out
-    at: wp.array3d[wp.float64],  # (C, 8, 2) places of the cuts across a direction: the middle, and the points' mean
-    area: wp.array3d[wp.float64],  # (C, 8, 2) of the smallest boxes of both pieces
+    at: wp.array3d[
+        wp.float64
+    ],  # out: (C, 8, 2) places of the cuts across a direction: the middle, and the points' mean
+    area: wp.array3d[wp.float64],  # out: (C, 8, 2) of the smallest boxes of both pieces
 ):
     i = start + wp.tid()
     kind = i % 2

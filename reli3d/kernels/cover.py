@@ -51,7 +51,6 @@ def out_of_block(cell: wp.vec3, along: wp.vec3, block: wp.vec3i) -> float:
 @wp.kernel
 def residual_kernel(
     start: int,
-    # in
     sdf: wp.array3d[float],
     lowest: wp.array3d[float],  # of each block of BLOCK_CELLS cells a side, border included
     distance: wp.array3d[float],
@@ -61,8 +60,7 @@ def residual_kernel(
     depth: float,
     field_max: float,
     stride: int,
-    # out
-    residual: wp.array3d[float],  # (V, H // stride, W // stride)
+    residual: wp.array3d[float],  # out: (V, H // stride, W // stride)
 ):
     """Coverage residual of a pixel: the amount by which the minimum of the field along its ray exceeds ``-depth``.
 
@@ -110,7 +108,6 @@ def residual_kernel(
 @wp.kernel
 def lower_kernel(
     start: int,
-    # in
     sdf: wp.array3d[float],
     bound: wp.array3d[float],
     residual: wp.array3d[float],
@@ -119,8 +116,7 @@ def lower_kernel(
     radius: float,
     field_max: float,
     stride: int,
-    # out
-    lowered: wp.array3d[float],
+    lowered: wp.array3d[float],  # out
 ):
     """Field minus the largest coverage residual of the rays through a point, clamped from below to ``bound``."""
     n = start + wp.tid()

@@ -40,12 +40,10 @@ def signed_distance(mesh: wp.uint64, point: wp.vec3, reach: float) -> float:
 @wp.kernel
 def signed_distance_kernel(
     start: int,
-    # in
     mesh: wp.uint64,
     points: wp.array[wp.vec3],
     reach: float,
-    # out
-    distance: wp.array[float],
+    distance: wp.array[float],  # out
 ):
     i = start + wp.tid()
     distance[i] = signed_distance(mesh, points[i], reach)

@@ -183,16 +183,14 @@ def stretch_of(direction: wp.vec3) -> float:
 @wp.kernel
 def embree_closest_kernel(
     start: int,
-    # in
     intersect1: wp.uint64,
     scene: wp.uint64,
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     t_max: wp.array[float],
-    # out
-    face: wp.array[wp.int32],
-    t: wp.array[float],
-    bary: wp.array[wp.vec2],
+    face: wp.array[wp.int32],  # out
+    t: wp.array[float],  # out
+    bary: wp.array[wp.vec2],  # out
 ):
     i = start + wp.tid()
     o = origins[i]
@@ -213,14 +211,12 @@ def embree_closest_kernel(
 @wp.kernel
 def embree_occluded_kernel(
     start: int,
-    # in
     occluded1: wp.uint64,
     scene: wp.uint64,
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     t_max: wp.array[float],
-    # out
-    occluded: wp.array[wp.bool],
+    occluded: wp.array[wp.bool],  # out
 ):
     i = start + wp.tid()
     o = origins[i]
@@ -235,13 +231,11 @@ def embree_occluded_kernel(
 @wp.kernel
 def embree_unoccluded_kernel(
     start: int,
-    # in
     occluded16: wp.uint64,
     scene: wp.uint64,
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
-    # in and out
-    t_max: wp.array[float],
+    t_max: wp.array[float],  # in and out
 ):
     """``t_max`` becomes -1 where anything is met up to it; :data:`GROUP` rays a thread."""
     first = (start + wp.tid()) * GROUP
@@ -251,13 +245,11 @@ def embree_unoccluded_kernel(
 @wp.kernel
 def ray_key_kernel(
     start: int,
-    # in
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     low: wp.vec3,
     per_cell: wp.vec3,
-    # out
-    key: wp.array[wp.int16],
+    key: wp.array[wp.int16],  # out
 ):
     """:data:`RUN` rays a thread."""
     first = (start + wp.tid()) * RUN

@@ -147,11 +147,9 @@ def pdf_envmap_uv(density: wp.array2d[float], uv: wp.vec2) -> float:
 @wp.kernel
 def lookup_envmap_kernel(
     start: int,
-    # in
     radiance: wp.array2d[wp.vec3],
     directions: wp.array[wp.vec3],
-    # out
-    out: wp.array[wp.vec3],
+    out: wp.array[wp.vec3],  # out
 ):
     i = start + wp.tid()
     out[i] = lookup_envmap(radiance, directions[i])
@@ -160,14 +158,12 @@ def lookup_envmap_kernel(
 @wp.kernel
 def lookup_adjoint_kernel(
     start: int,
-    # in
     first: int,
     radiance: wp.array2d[wp.vec3],
     directions: wp.array[wp.vec3],
     g_out: wp.array[wp.vec3],
-    # out
-    g_radiance: wp.array2d[wp.vec3],
-    g_directions: wp.array[wp.vec3],
+    g_radiance: wp.array2d[wp.vec3],  # out
+    g_directions: wp.array[wp.vec3],  # out
 ):
     """Adjoints of the lookups from ``first``; an output without rows is left out.  ``g_radiance`` is added to.
 
@@ -201,16 +197,14 @@ def lookup_adjoint_kernel(
 @wp.kernel
 def sample_envmap_kernel(
     start: int,
-    # in
     rows: wp.array2d[float],
     columns: wp.array2d[float],
     row_guide: wp.array2d[wp.int32],
     column_guide: wp.array2d[wp.int32],
     density: wp.array2d[float],
     u: wp.array[wp.vec2],
-    # out
-    directions: wp.array[wp.vec3],
-    pdf: wp.array[float],
+    directions: wp.array[wp.vec3],  # out
+    pdf: wp.array[float],  # out
 ):
     i = start + wp.tid()
     drawn = sample_envmap(rows, columns, row_guide, column_guide, u[i])
@@ -221,11 +215,9 @@ def sample_envmap_kernel(
 @wp.kernel
 def pdf_envmap_kernel(
     start: int,
-    # in
     density: wp.array2d[float],
     directions: wp.array[wp.vec3],
-    # out
-    pdf: wp.array[float],
+    pdf: wp.array[float],  # out
 ):
     i = start + wp.tid()
     pdf[i] = pdf_envmap_uv(density, direction_to_uv(directions[i]))

@@ -149,14 +149,12 @@ def column_bits(sdf: wp.array[float], index: int, step_x: int, step_y: int, has_
 @wp.kernel
 def classify_kernel(
     start: int,
-    # in
     sdf: wp.array[float],
     nx: int,
     ny: int,
     nz: int,
-    # out
-    codes: wp.array[wp.uint8],
-    crossed: wp.array[wp.uint8],
+    codes: wp.array[wp.uint8],  # out
+    crossed: wp.array[wp.uint8],  # out
 ):
     """Case of each cube, and the crossed edges of each vertex.
 
@@ -200,17 +198,15 @@ def classify_kernel(
 @wp.kernel
 def resolve_kernel(
     start: int,
-    # in
     cells: wp.array[wp.int32],
     codes: wp.array[wp.uint8],
     neighbor: wp.array[wp.int32],
     count: wp.array[wp.int32],
     ny: int,
     nz: int,
-    # out
-    resolved: wp.array[wp.int32],
-    counts: wp.array[wp.int32],
-    slot: wp.array[wp.int32],
+    resolved: wp.array[wp.int32],  # out
+    counts: wp.array[wp.int32],  # out
+    slot: wp.array[wp.int32],  # out
 ):
     """Resolved case of a surface cube: the complement of its case if it shares its ambiguous face with a cube that is
     ambiguous at the same face (C16 and C19 of Wenger 2013), else the case itself.
@@ -240,7 +236,6 @@ def resolve_kernel(
 @wp.kernel
 def dual_vertex_kernel(
     start: int,
-    # in
     cube: wp.array[wp.int32],
     group: wp.array[wp.int32],
     surface: SurfaceCubes,
@@ -248,8 +243,7 @@ def dual_vertex_kernel(
     grid: Grid,
     weights: Weights,
     scale: wp.vec3,
-    # out
-    vertices: wp.array[wp.vec3],
+    vertices: wp.array[wp.vec3],  # out
 ):
     """Dual vertex ``group`` of surface cube ``cube``: the mean, weighted by beta, of the zero crossings on its edges.
 
@@ -286,16 +280,14 @@ def dual_vertex_kernel(
 @wp.kernel
 def quad_kernel(
     start: int,
-    # in
     origin: wp.array[wp.int32],
     direction: wp.array[wp.int32],
     surface: SurfaceCubes,
     tables: Tables,
     grid: Grid,
     gamma: wp.array[float],
-    # out
-    quads: wp.array[wp.int32],
-    split: wp.array[float],
+    quads: wp.array[wp.int32],  # out
+    split: wp.array[float],  # out
 ):
     """The quad of a crossed edge: the dual vertices of its four cubes, counter-clockwise seen from outside.
 

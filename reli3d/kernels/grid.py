@@ -19,11 +19,9 @@ def between_points(x: float, count: int) -> wp.vec2:
 @wp.kernel
 def sample_grid_kernel(
     start: int,
-    # in
     grid: wp.array4d[float],  # (X, Y, Z, C)
     points: wp.array[wp.vec3],  # (N,) in [-1, 1], which spans the outermost grid points
-    # out
-    features: wp.array2d[float],  # (N, C)
+    features: wp.array2d[float],  # out: (N, C)
 ):
     n = start + wp.tid()
     p = points[n]
@@ -69,12 +67,10 @@ def value_or_zero(values: wp.array3d[float], i: int, j: int, k: int) -> float:
 @wp.kernel(enable_backward=False)
 def weighted_laplacian_kernel(
     start: int,
-    # in
     field: wp.array3d[float],
     weight: wp.array3d[float],
-    # out
-    product: wp.array3d[float],  # weight * laplacian, 0 at the border
-    total: wp.array[float],  # sum of weight * laplacian**2 over a row of the grid
+    product: wp.array3d[float],  # out: weight * laplacian, 0 at the border
+    total: wp.array[float],  # out: sum of weight * laplacian**2 over a row of the grid
 ):
     row = start + wp.tid()
     i = row // field.shape[1]
@@ -94,11 +90,9 @@ def weighted_laplacian_kernel(
 @wp.kernel(enable_backward=False)
 def weighted_laplacian_adjoint_kernel(
     start: int,
-    # in
     product: wp.array3d[float],
     scale: wp.array[float],  # one number
-    # out
-    g_field: wp.array3d[float],
+    g_field: wp.array3d[float],  # out
 ):
     """Gradient of the weighted squared Laplacian; the Laplacian is self-adjoint."""
     row = start + wp.tid()

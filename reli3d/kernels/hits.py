@@ -31,13 +31,11 @@ def wrap(k: int, size: int) -> int:
 @wp.kernel
 def interpolate_kernel(
     start: int,
-    # in
     values: wp.array[Any],
     faces: wp.array2d[wp.int32],
     face: wp.array[wp.int32],
     bary: wp.array[wp.vec2],
-    # out
-    out: wp.array[Any],
+    out: wp.array[Any],  # out
 ):
     i = start + wp.tid()
     f = face[i]
@@ -57,12 +55,10 @@ INTERPOLATE = {  # by the number of channels
 @wp.kernel
 def hit_normal_kernel(
     start: int,
-    # in
     vertices: wp.array[wp.vec3],
     faces: wp.array2d[wp.int32],
     face: wp.array[wp.int32],
-    # out
-    out: wp.array[wp.vec3],
+    out: wp.array[wp.vec3],  # out
 ):
     """Outward normal of a counter-clockwise face."""
     i = start + wp.tid()
@@ -79,7 +75,6 @@ def hit_normal_kernel(
 @wp.kernel
 def reevaluate_kernel(
     start: int,
-    # in
     vertices: wp.array[wp.vec3],
     faces: wp.array2d[wp.int32],
     face: wp.array[wp.int32],
@@ -87,9 +82,8 @@ def reevaluate_kernel(
     directions: wp.array[wp.vec3],
     hit_t: wp.array[float],
     hit_bary: wp.array[wp.vec2],
-    # out
-    t: wp.array[float],
-    bary: wp.array[wp.vec2],
+    t: wp.array[float],  # out
+    bary: wp.array[wp.vec2],  # out
 ):
     """Ray against the plane of a known face.  Moller and Trumbore 1997, without their early exits.
 
@@ -116,11 +110,9 @@ def reevaluate_kernel(
 @wp.kernel
 def sample_texture_kernel(
     start: int,
-    # in
     texture: wp.array2d[wp.vec3],
     uv: wp.array[wp.vec2],
-    # out
-    out: wp.array[wp.vec3],
+    out: wp.array[wp.vec3],  # out
 ):
     i = start + wp.tid()
     height = texture.shape[0]

@@ -58,14 +58,12 @@ def distance_to_hull(
 @wp.kernel
 def hull_distance_kernel(
     start: int,
-    # in
     points: wp.array[wp.vec3],
     distance: wp.array3d[float],
     c2w: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
     far: float,
-    # out
-    hull: wp.array[float],
+    hull: wp.array[float],  # out
 ):
     i = start + wp.tid()
     hull[i] = distance_to_hull(points[i], distance, c2w, intrinsics, far)
@@ -74,7 +72,6 @@ def hull_distance_kernel(
 @wp.kernel
 def mirror_residual_kernel(
     start: int,
-    # in
     points: wp.array2d[wp.vec3],  # (R, D) along rays
     known: wp.array2d[bool],  # (R, D) whether the point is in the hull
     normal: wp.array[wp.vec3],  # (P,) of planes, unit
@@ -83,8 +80,7 @@ def mirror_residual_kernel(
     distance: wp.array3d[float],
     c2w: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
-    # out
-    residual: wp.array2d[float],  # (P, R)
+    residual: wp.array2d[float],  # out: (P, R)
 ):
     """Least distance outside the hull of the mirror images of a ray's known points, at most ``most``."""
     i = start + wp.tid()
@@ -105,15 +101,13 @@ def mirror_residual_kernel(
 @wp.kernel
 def hull_span_kernel(
     start: int,
-    # in
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     radius: float,
     distance: wp.array3d[float],
     c2w: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
-    # out
-    span: wp.array[wp.vec2],
+    span: wp.array[wp.vec2],  # out
 ):
     """Sphere tracing from both ends of a ray's chord in the sphere of ``radius`` around the origin."""
     i = start + wp.tid()
@@ -224,10 +218,8 @@ def squared_to_contour(mask: wp.array3d[float], view: int, y: int, x: int, p: wp
 @wp.kernel
 def column_kernel(
     start: int,
-    # in
     mask: wp.array3d[float],
-    # out
-    row: wp.array3d[float],
+    row: wp.array3d[float],  # out
 ):
     """Row of the nearest contour crossing in a pixel's column; ``NO_SITE_ROWS`` away if there is none.
 
@@ -261,13 +253,11 @@ def column_kernel(
 @wp.kernel
 def row_kernel(
     start: int,
-    # in
     row: wp.array3d[float],
     # scratch
     apex: wp.array3d[wp.int32],
     begin: wp.array3d[float],
-    # out
-    nearest: wp.array3d[wp.int32],
+    nearest: wp.array3d[wp.int32],  # out
 ):
     """Column of the nearest crossing, given the nearest one of each column in ``row``; -1 without any.  One thread per
     row.
@@ -289,15 +279,13 @@ def row_kernel(
 @wp.kernel
 def mask_distance_kernel(
     start: int,
-    # in
     mask: wp.array3d[float],
     row: wp.array3d[float],
     nearest_x: wp.array3d[wp.int32],
     column: wp.array3d[float],
     nearest_y: wp.array3d[wp.int32],
     far: float,
-    # out
-    distance: wp.array3d[float],
+    distance: wp.array3d[float],  # out
 ):
     """Signed distance to the contour, ``far`` without one.
 

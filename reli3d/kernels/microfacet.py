@@ -118,12 +118,10 @@ def pdf_vndf_mirrored(facet: Facet, wo: wp.vec3) -> float:
 @wp.kernel
 def sample_ggx_vndf_kernel(
     start: int,
-    # in
     wo: wp.array[wp.vec3],
     alpha: wp.array[float],
     u: wp.array[wp.vec2],
-    # out
-    wm: wp.array[wp.vec3],
+    wm: wp.array[wp.vec3],  # out
 ):
     i = start + wp.tid()
     width = wp.max(alpha[i], ALPHA_MIN)
@@ -133,12 +131,10 @@ def sample_ggx_vndf_kernel(
 @wp.kernel
 def pdf_ggx_vndf_kernel(
     start: int,
-    # in
     wo: wp.array[wp.vec3],
     alpha: wp.array[float],
     wm: wp.array[wp.vec3],
-    # out
-    pdf: wp.array[float],
+    pdf: wp.array[float],  # out
 ):
     i = start + wp.tid()
     pdf[i] = pdf_ggx_vndf(wo[i], wp.max(alpha[i], ALPHA_MIN), wm[i])

@@ -70,15 +70,13 @@ def gradient_noise(q: wp.vec3, seed: wp.uint32) -> wp.vec4:
 @wp.kernel
 def fbm_kernel(
     start: int,
-    # in
     points: wp.array[wp.vec3],
     octaves: int,
     gain: float,
     ridged: int,
     seed: int,
-    # out
-    value: wp.array[float],
-    gradient: wp.array[wp.vec3],
+    value: wp.array[float],  # out
+    gradient: wp.array[wp.vec3],  # out
 ):
     i = start + wp.tid()
     q = points[i]
@@ -102,13 +100,11 @@ def fbm_kernel(
 @wp.kernel
 def cells_kernel(
     start: int,
-    # in
     points: wp.array[wp.vec3],
     seed: int,
-    # out
-    distance: wp.array[wp.vec2],
-    cell: wp.array[float],
-    gradient: wp.array[wp.vec3],
+    distance: wp.array[wp.vec2],  # out
+    cell: wp.array[float],  # out
+    gradient: wp.array[wp.vec3],  # out
 ):
     i = start + wp.tid()
     q = points[i]

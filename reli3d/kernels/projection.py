@@ -26,14 +26,12 @@ def project_point(p: wp.vec3, c2w: wp.mat44, k: wp.vec4) -> wp.vec3:
 @wp.kernel
 def gather_views_kernel(
     start: int,
-    # in
     maps: wp.array4d[float],  # (V, H, W, C)
     points: wp.array[wp.vec3],  # (N,)
     c2w: wp.array[wp.mat44],  # (V,)
     intrinsics: wp.array[wp.vec4],  # (V,) in units of the maps' pixels
-    # out
-    features: wp.array3d[float],  # (N, V, C)
-    pixels: wp.array2d[wp.vec3],  # (N, V)
+    features: wp.array3d[float],  # out: (N, V, C)
+    pixels: wp.array2d[wp.vec3],  # out: (N, V)
 ):
     i = start + wp.tid()
     views = maps.shape[0]

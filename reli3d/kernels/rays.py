@@ -46,15 +46,13 @@ def hit_occluded(mesh: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: fl
 @wp.kernel
 def closest_kernel(
     start: int,
-    # in
     mesh: wp.uint64,
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     t_max: wp.array[float],
-    # out
-    face: wp.array[wp.int32],
-    t: wp.array[float],
-    bary: wp.array[wp.vec2],
+    face: wp.array[wp.int32],  # out
+    t: wp.array[float],  # out
+    bary: wp.array[wp.vec2],  # out
 ):
     i = start + wp.tid()
     o = origins[i]
@@ -74,13 +72,11 @@ def closest_kernel(
 @wp.kernel
 def occluded_kernel(
     start: int,
-    # in
     mesh: wp.uint64,
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     t_max: wp.array[float],
-    # out
-    occluded: wp.array[wp.bool],
+    occluded: wp.array[wp.bool],  # out
 ):
     i = start + wp.tid()
     o = origins[i]
@@ -94,13 +90,11 @@ def occluded_kernel(
 @wp.kernel
 def offset_origin_kernel(
     start: int,
-    # in
     position: wp.array[wp.vec3],
     ng: wp.array[wp.vec3],
     direction: wp.array[wp.vec3],
     scale: float,
-    # out
-    origin: wp.array[wp.vec3],
+    origin: wp.array[wp.vec3],  # out
 ):
     i = start + wp.tid()
     origin[i] = offset_origin(position[i], ng[i], direction[i], scale)
@@ -109,7 +103,6 @@ def offset_origin_kernel(
 @wp.kernel
 def sight_kernel(
     start: int,
-    # in
     position: wp.array[wp.vec3],
     normal: wp.array[wp.vec3],
     c2w: wp.array[wp.mat44],
@@ -117,10 +110,9 @@ def sight_kernel(
     pair: wp.array[wp.int32],
     size: wp.vec2,
     grazing: float,
-    # out
-    origin: wp.array[wp.vec3],
-    direction: wp.array[wp.vec3],
-    t_max: wp.array[float],
+    origin: wp.array[wp.vec3],  # out
+    direction: wp.array[wp.vec3],  # out
+    t_max: wp.array[float],  # out
 ):
     """Ray from a surface point to a camera; ``t_max`` is -1 if the point faces away or projects outside the image.
 

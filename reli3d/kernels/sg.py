@@ -128,13 +128,11 @@ def shade_lobe(
 @wp.kernel
 def eval_sg_kernel(
     start: int,
-    # in
     axis: wp.array[wp.vec3],
     sharpness: wp.array[float],
     amplitude: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
-    # out
-    out: wp.array[wp.vec3],
+    out: wp.array[wp.vec3],  # out
 ):
     i = start + wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
@@ -146,13 +144,11 @@ def eval_sg_kernel(
 @wp.kernel
 def irradiance_sg_kernel(
     start: int,
-    # in
     axis: wp.array[wp.vec3],
     sharpness: wp.array[float],
     amplitude: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
-    # out
-    out: wp.array[wp.vec3],
+    out: wp.array[wp.vec3],  # out
 ):
     i = start + wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
@@ -164,7 +160,6 @@ def irradiance_sg_kernel(
 @wp.kernel
 def shade_sg_kernel(
     start: int,
-    # in
     normal: wp.array[wp.vec3],
     wo: wp.array[wp.vec3],
     base_color: wp.array[wp.vec3],
@@ -173,8 +168,7 @@ def shade_sg_kernel(
     axis: wp.array[wp.vec3],
     sharpness: wp.array[float],
     amplitude: wp.array[wp.vec3],
-    # out
-    out: wp.array[wp.vec3],
+    out: wp.array[wp.vec3],  # out
 ):
     i = start + wp.tid()
     a = wp.max(alpha[i], ALPHA_MIN)

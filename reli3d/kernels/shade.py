@@ -247,15 +247,13 @@ def sample_value(surface: Surface, plan: Plan, draw: Draw, light: wp.vec3) -> wp
 @wp.kernel
 def shade_kernel(
     start: int,
-    # in
     points: Points,
     light: Light,
     plan: Plan,
     mesh: wp.uint64,
     shadows: int,
-    # out
-    out: wp.array[wp.vec3],
-    visible: wp.array2d[wp.int32],
+    out: wp.array[wp.vec3],  # out
+    visible: wp.array2d[wp.int32],  # out
 ):
     """Radiance of each hit; traces shadow rays through Warp's BVH."""
     i = start + wp.tid()

@@ -106,19 +106,17 @@ def add_sample_gradient(
 @wp.kernel
 def shade_adjoint_kernel(
     start: int,
-    # in
     first: int,
     points: Points,
     light: Light,
     plan: Plan,
     visible: wp.array2d[wp.int32],
     g_out: wp.array[wp.vec3],
-    # out
-    g_normal: wp.array[wp.vec3],
-    g_base_color: wp.array[wp.vec3],
-    g_alpha: wp.array[float],
-    g_metallic: wp.array[float],
-    g_radiance: wp.array2d[wp.vec3],
+    g_normal: wp.array[wp.vec3],  # out
+    g_base_color: wp.array[wp.vec3],  # out
+    g_alpha: wp.array[float],  # out
+    g_metallic: wp.array[float],  # out
+    g_radiance: wp.array2d[wp.vec3],  # out
 ):
     """Adjoints of the hits from ``first``; ``g_radiance`` is added to.  An output without rows is left out."""
     i = first + start + wp.tid()

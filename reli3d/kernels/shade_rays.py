@@ -14,16 +14,14 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=
 @wp.kernel
 def shade_rays_kernel(
     start: int,
-    # in
     first: int,
     points: Points,
     light: Light,
     plan: Plan,
-    # out
-    origins: wp.array[wp.vec3],
-    directions: wp.array[wp.vec3],
-    t_max: wp.array[float],
-    values: wp.array[wp.vec3],
+    origins: wp.array[wp.vec3],  # out
+    directions: wp.array[wp.vec3],  # out
+    t_max: wp.array[float],  # out
+    values: wp.array[wp.vec3],  # out
 ):
     """First half of the estimator for a chunk of hits: shadow rays (``t_max`` < 0 where none is needed) and values."""
     j = start + wp.tid()
@@ -44,7 +42,6 @@ def shade_rays_kernel(
 @wp.kernel
 def accumulate_kernel(
     start: int,
-    # in
     first: int,
     hits: int,
     group: int,
@@ -54,11 +51,9 @@ def accumulate_kernel(
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     values: wp.array[wp.vec3],
-    # in and out
-    t_max: wp.array[float],
-    # out
-    out: wp.array[wp.vec3],
-    visible: wp.array2d[wp.int32],
+    t_max: wp.array[float],  # in and out
+    out: wp.array[wp.vec3],  # out
+    visible: wp.array2d[wp.int32],  # out
 ):
     """Second half: the sum of a hit's values whose shadow rays nothing stops; ``t_max`` of the others becomes -1.
 

@@ -117,14 +117,12 @@ def sample_point(
 @wp.kernel
 def sample_kernel(
     start: int,
-    # in
     planes: wp.array[vec8],
     points: wp.array[wp.vec3],
     order: wp.array[wp.int32],
     sizes: Sizes,
     split: int,
-    # out
-    features: wp.array[vec8],
+    features: wp.array[vec8],  # out
 ):
     """A thread is a plane, a point and every ``split``-th block; points come by ``order`` if that has entries."""
     i = start + wp.tid()
@@ -159,7 +157,6 @@ def copy_row(planes: wp.array[float], slab: int, y: int, channels: int, sizes: S
 @wp.kernel
 def sample_rows_kernel(
     start: int,
-    # in
     planes: wp.array[float],
     points: wp.array[wp.vec3],
     order: wp.array[wp.int32],
@@ -169,8 +166,7 @@ def sample_rows_kernel(
     bands: int,
     # scratch
     scratch: wp.array[vec8],
-    # out
-    features: wp.array[vec8],
+    features: wp.array[vec8],  # out
 ):
     """As :func:`sample_kernel` from channel-first planes: a thread is a band of rows of cells of a plane.
 
@@ -227,13 +223,11 @@ def sample_rows_kernel(
 @wp.kernel
 def points_adjoint_kernel(
     start: int,
-    # in
     planes: wp.array[vec8],
     points: wp.array[wp.vec3],
     g_features: wp.array[vec8],
     sizes: Sizes,
-    # out
-    g_points: wp.array[wp.vec3],
+    g_points: wp.array[wp.vec3],  # out
 ):
     """Gradient of the features with respect to a point; one-sided, towards +, at a texel center."""
     point = start + wp.tid()
@@ -274,12 +268,10 @@ def points_adjoint_kernel(
 @wp.kernel
 def cell_key_kernel(
     start: int,
-    # in
     points: wp.array[wp.vec3],
     sizes: Sizes,
     bins: int,
-    # out
-    keys: wp.array[wp.int32],
+    keys: wp.array[wp.int32],  # out
 ):
     """``row * bins + bin``: the row of cells ``floor(y) + 1`` of a point in a plane, and which part of it.
 
@@ -310,7 +302,6 @@ def add_texel(g_planes: wp.array[vec8], base: int, x: int, y: int, sizes: Sizes,
 @wp.kernel
 def planes_adjoint_kernel(
     start: int,
-    # in
     points: wp.array[wp.vec3],
     g_features: wp.array[vec8],
     order: wp.array[wp.int32],
@@ -320,8 +311,7 @@ def planes_adjoint_kernel(
     row_parity: int,
     parity: int,
     split: int,
-    # out
-    g_planes: wp.array[vec8],
+    g_planes: wp.array[vec8],  # out
 ):
     """Gradient of the planes: a thread adds the points of one segment of a row of cells, for every ``split``-th channel
     block, to the two adjacent rows of texels.

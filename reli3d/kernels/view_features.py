@@ -115,12 +115,10 @@ def write_summary(
 @wp.kernel
 def view_summary_kernel(
     start: int,
-    # in
     viewed: Viewed,
-    # out
-    numbers: wp.array3d[float],  # (N, V, 9) from view_numbers
-    weight: wp.array2d[float],  # (N, V), sums to 1 over the views
-    summary: wp.array2d[float],  # (N, 9) mean color, its deviation, min silhouette distance, max weight, position
+    numbers: wp.array3d[float],  # out: (N, V, 9) from view_numbers
+    weight: wp.array2d[float],  # out: (N, V), sums to 1 over the views
+    summary: wp.array2d[float],  # out: (N, 9) mean color, its deviation, min silhouette distance, max weight, position
 ):
     n = start + wp.tid()
     p = viewed.points[n]
@@ -170,13 +168,11 @@ def silu(x: vec8) -> vec8:
 @wp.kernel
 def pool_views_kernel(
     start: int,
-    # in
     viewed: Viewed,
     tokens: wp.array4d[vec8],  # (V, P, P, B) tokens multiplied by the hidden layer's weight, plus its bias
     mix: wp.array2d[vec8],  # (9, B) the hidden layer's weight for the features of view_numbers
-    # out
-    pooled: wp.array2d[vec8],  # (N, B) weighted mean of the hidden layer over the views
-    summary: wp.array2d[float],  # (N, 9) as in view_summary_kernel
+    pooled: wp.array2d[vec8],  # out: (N, B) weighted mean of the hidden layer over the views
+    summary: wp.array2d[float],  # out: (N, 9) as in view_summary_kernel
 ):
     """Hidden layer of every view and its weighted mean in one pass, without per-view results in memory."""
     n = start + wp.tid()
@@ -247,16 +243,16 @@ def mix_four(images: wp.array3d[wp.vec4], view: int, i: int, j: int, weights: wp
 @wp.kernel
 def fuse_views_kernel(
     start: int,
-    # in
     viewed: Viewed,  # surface points
     base: wp.array3d[wp.vec4],  # (V, P, P) gain of the mean color logit, shift of the logits
     rough_metal: wp.array3d[wp.vec4],  # (V, P, P) confidence, roughness, metallic, gain of the logits minus their mean
     normals: wp.array3d[wp.vec4],  # (V, P, P) normal; 0
-    # out
-    logit: wp.array[wp.vec3],  # (N,) of the base color
-    numbers: wp.array2d[float],  # (N, 10): roughness, metallic, gain, normal - mesh normal (3), cosine, max weight,
-    #                              confidence, spread
-    shading: wp.array[wp.vec3],  # (N,) unit normal
+    logit: wp.array[wp.vec3],  # out: (N,) of the base color
+    numbers: wp.array2d[
+        float
+    ],  # out: (N, 10): roughness, metallic, gain, normal - mesh normal (3), cosine, max weight,
+    # out:                              confidence, spread
+    shading: wp.array[wp.vec3],  # out: (N,) unit normal
 ):
     """Blends the views' predictions, weighted by view_weight**2 * exp(confidence).
 

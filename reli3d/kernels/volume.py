@@ -89,7 +89,6 @@ def step_thickness(density: float, step: float) -> float:
 @wp.kernel
 def samples_kernel(
     start: int,
-    # in
     occupied: wp.array3d[wp.uint8],
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
@@ -100,9 +99,8 @@ def samples_kernel(
     far: float,
     emit: int,
     first: wp.array[wp.int32],
-    # out
-    count: wp.array[wp.int32],
-    t: wp.array[float],
+    count: wp.array[wp.int32],  # out
+    t: wp.array[float],  # out
 ):
     """Count (``emit`` 0) or list (1, from ``first[i]``) the samples of ray ``i``."""
     i = start + wp.tid()
@@ -126,16 +124,14 @@ def samples_kernel(
 @wp.kernel
 def composite_kernel(
     start: int,
-    # in
     density: wp.array[float],
     color: wp.array[wp.vec3],
     t: wp.array[float],
     first: wp.array[wp.int32],
     step: float,
-    # out
-    out: wp.array[wp.vec3],
-    opacity: wp.array[float],
-    depth: wp.array[float],
+    out: wp.array[wp.vec3],  # out
+    opacity: wp.array[float],  # out
+    depth: wp.array[float],  # out
 ):
     """Emission and absorption, Max 1995: a sample counts ``T (1 - exp(-density step))`` of its color and distance."""
     i = start + wp.tid()
@@ -158,7 +154,6 @@ def composite_kernel(
 @wp.kernel
 def composite_adjoint_kernel(
     start: int,
-    # in
     density: wp.array[float],
     color: wp.array[wp.vec3],
     t: wp.array[float],
@@ -167,9 +162,8 @@ def composite_adjoint_kernel(
     g_out: wp.array[wp.vec3],
     g_opacity: wp.array[float],
     g_depth: wp.array[float],
-    # out
-    g_density: wp.array[float],
-    g_color: wp.array[wp.vec3],
+    g_density: wp.array[float],  # out
+    g_color: wp.array[wp.vec3],  # out
 ):
     """Back to front: with e the adjoint of a sample's weight, d loss / d own thickness = T_after e - sum behind of w e.
 

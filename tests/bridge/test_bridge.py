@@ -22,14 +22,12 @@ SIZES = [1, 7, _bridge.SLICE_MIN * _bridge.SLICES + 5]  # one thread, one slice,
 @wp.kernel
 def gather_scale_kernel(
     start: int,
-    # in
     table: wp.array[wp.vec3],
     index: wp.array[int],
     weight: wp.array[float],
     factor: float,
-    # out
-    value: wp.array[wp.vec3],
-    parity: wp.array[int],
+    value: wp.array[wp.vec3],  # out
+    parity: wp.array[int],  # out
 ):
     i = start + wp.tid()
     value[i] = factor * weight[i] * table[index[i]]
@@ -39,10 +37,8 @@ def gather_scale_kernel(
 @wp.kernel
 def square_kernel(
     start: int,
-    # in
     x: wp.array[float],
-    # out
-    y: wp.array[float],
+    y: wp.array[float],  # out
 ):
     i = start + wp.tid()
     y[i] = x[i] * x[i]
@@ -51,8 +47,7 @@ def square_kernel(
 @wp.kernel
 def count_kernel(
     start: int,
-    # out
-    visits: wp.array[int],
+    visits: wp.array[int],  # out
 ):
     i = start + wp.tid()
     visits[i] = visits[i] + i
