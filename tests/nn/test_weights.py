@@ -301,3 +301,21 @@ def test_written_files_hold_bfloat16_and_scalars(tmp_path):
     with safe_open(path, "pt") as file:
         for name, value in state.items():
             torch.testing.assert_close(file.get_tensor(name), value, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    "instructions, has",
+    [
+        ({"avx512_bf16": True}, True),
+        ({"amx_bf16": True, "avx512_bf16": False}, True),
+        ({"bf16": True}, True),
+        ({"avx512_f": True, "avx512_bf16": False}, False),
+        ({}, False),
+    ],
+)
+def test_automatic_precision_is_bfloat16_where_the_processor_multiplies_it(tmp_path, monkeypatch, instructions, has):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: instructions, raising=False)
+    expected = torch.bfloat16 if has else torch.float32
+    save(tmp_path / "nano.safetensors", Reconstructor(NANO), license="none")
+    assert load_model(tmp_path / "nano.safetensors", trunk="auto").dtype == expected
+    assert load_model("small", trunk="auto").dtype == expected
