@@ -34,11 +34,19 @@ T = TypeVar("T")
 F = TypeVar("F", bound=Callable)
 
 _TORCH = {
-    wp.float32: (torch.float32, ()), wp.int16: (torch.int16, ()), wp.int32: (torch.int32, ()),
-    wp.int64: (torch.int64, ()), wp.uint8: (torch.uint8, ()), wp.bool: (torch.bool, ()),
-    wp.vec2: (torch.float32, (2,)), wp.vec3: (torch.float32, (3,)), wp.vec4: (torch.float32, (4,)),
-    wp.vec4d: (torch.float64, (4,)), wp.mat33: (torch.float32, (3, 3)), wp.mat44: (torch.float32, (4, 4)),
-}  # fmt: skip
+    wp.float32: (torch.float32, ()),
+    wp.int16: (torch.int16, ()),
+    wp.int32: (torch.int32, ()),
+    wp.int64: (torch.int64, ()),
+    wp.uint8: (torch.uint8, ()),
+    wp.bool: (torch.bool, ()),
+    wp.vec2: (torch.float32, (2,)),
+    wp.vec3: (torch.float32, (3,)),
+    wp.vec4: (torch.float32, (4,)),
+    wp.vec4d: (torch.float64, (4,)),
+    wp.mat33: (torch.float32, (3, 3)),
+    wp.mat44: (torch.float32, (4, 4)),
+}
 
 
 @lru_cache(1)

@@ -11,13 +11,6 @@ from reli3d.errors import InputError, printable
 FAILED_CHECKS = 3  # exit code
 LEAST_IOU = 0.9  # of the asset's silhouettes with the masks
 
-HELP = """
---mask-method  grabcut: from the points of the object and of its support; key: pixels that differ from a uniform
-    background; rembg: a network (pip install 'reli3d[masks]'), fetched once
---turntable  the object rotates in front of a fixed camera (default: detected)
---size  longest side of the object in millimeters; units become meters
-"""
-
 
 def parser() -> Parser:
     p = Parser(
@@ -30,11 +23,22 @@ def parser() -> Parser:
     p.add_argument("source", type=Path, help="folder of JPEG, HEIC or PNG photographs, or a video (mp4, mov)")
     p.add_argument("output", type=Path, help="object folder to write, with capture.json and capture.png")
     p.add_argument("--masks", type=Path, help="folder of masks named like the photographs, instead of --mask-method")
-    p.add_argument("--mask-method", choices=("grabcut", "key", "rembg"), default="grabcut")
-    p.add_argument("--turntable", action=argparse.BooleanOptionalAction)
-    p.add_argument("--size", type=float, metavar="MM")
+    p.add_argument(
+        "--mask-method",
+        choices=("grabcut", "key", "rembg"),
+        default="grabcut",
+        help="grabcut: from the points of the object and of its support; key: pixels that differ from a uniform "
+        "background; rembg: a network (pip install 'reli3d[masks]'), fetched once",
+    )
+    p.add_argument(
+        "--turntable",
+        action=argparse.BooleanOptionalAction,
+        help="the object rotates in front of a fixed camera (default: detected)",
+    )
+    p.add_argument(
+        "--size", type=float, metavar="MM", help="longest side of the object in millimeters; units become meters"
+    )
     p.add_argument("--infer", action="store_true", help="also reconstruct the asset, in OUTPUT/asset")
-    p.explain(HELP)
     return p
 
 

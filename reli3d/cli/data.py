@@ -14,17 +14,6 @@ from reli3d.errors import InputError
 
 COUNT, VIEWS = 1000, 6  # default numbers of seeds and views
 
-HELP = """
---protocol  paper: three environments per object, one file each; 100 views in total; for meshes without a
-    metallic-roughness texture 30 views, with images, cameras and environment only
---held-out  objects of the validation or test set, under held-out maps
---shapes  GLB files or folders of them, whose shapes are combined and get procedural materials
---materials  folder of material sets (basecolor, roughness, metallic, normal): surfaces are divided into regions with
-    different materials
---views-only  only images and maps of the views, one ray per pixel, for reli3d-train --stage pixels; more than 2 times
-    faster
-"""
-
 
 def parser() -> argparse.ArgumentParser:
     whole = Parser(prog="reli3d-data", description="Render training samples, and pack objects into shards.")
@@ -41,16 +30,38 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--views", type=int, help=f"views per object; default {VIEWS}, fixed by --protocol paper")
     p.add_argument("--size", type=int, default=192, help="pixels per side of a view")
-    p.add_argument("--protocol", choices=("own", "paper"), default="own")
-    p.add_argument("--held-out", choices=("validation", "test"))
+    p.add_argument(
+        "--protocol",
+        choices=("own", "paper"),
+        default="own",
+        help="paper: three environments per object, one file each; 100 views in total; for meshes without a "
+        "metallic-roughness texture 30 views, with images, cameras and environment only",
+    )
+    p.add_argument(
+        "--held-out", choices=("validation", "test"), help="objects of the validation or test set, under held-out maps"
+    )
     p.add_argument("--meshes", type=Path, nargs="+", help="GLB files or folders of them, instead of procedural objects")
-    p.add_argument("--shapes", type=Path, nargs="+")
-    p.add_argument("--materials", type=Path)
-    p.add_argument("--views-only", action="store_true")
+    p.add_argument(
+        "--shapes",
+        type=Path,
+        nargs="+",
+        help="GLB files or folders of them, whose shapes are combined and get procedural materials",
+    )
+    p.add_argument(
+        "--materials",
+        type=Path,
+        help="folder of material sets (basecolor, roughness, metallic, normal): surfaces are divided into regions with "
+        "different materials",
+    )
+    p.add_argument(
+        "--views-only",
+        action="store_true",
+        help="only images and maps of the views, one ray per pixel, for reli3d-train --stage pixels; more than 2 times "
+        "faster",
+    )
     where = p.add_mutually_exclusive_group()
     where.add_argument("--workers", type=int, help="number of processes; default one per core")
     where.add_argument("--ray", metavar="ADDRESS", help="render on a Ray cluster: auto, local, or its address")
-    p.explain(HELP)
     p.set_defaults(run=render)
     about = "write samples or captures as WebDataset tar files"
     p = actions.add_parser("pack", help=about, description=f"{about.capitalize()}; existing files are kept.")

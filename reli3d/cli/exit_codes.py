@@ -10,7 +10,6 @@ import atexit
 import contextlib
 import functools
 import os
-import re
 import signal
 import sys
 import threading
@@ -43,13 +42,6 @@ class Parser(argparse.ArgumentParser):
         self.add_argument(
             "--traceback", action="store_true", default=argparse.SUPPRESS, help="print the traceback of an error"
         )
-
-    def explain(self, texts: str) -> None:
-        """Sets the help of arguments by lines of ``texts`` that begin with their names, and indented lines."""
-        found = dict(re.findall(r"^(\S+) +(.*(?:\n +.*)*)", texts, re.M))
-        for action in self._actions:
-            for name in {action.dest, *action.option_strings} & set(found):
-                action.help = " ".join(found[name].split())
 
     def parse_args(self, args=None, namespace=None):
         found = super().parse_args(args, namespace)

@@ -11,13 +11,6 @@ from reli3d.errors import InputError
 
 FORMATS = ("glb", "obj", "usdz")
 
-HELP = """
---format  obj: with a material file and four PNG textures; usdz: needs pip install 'reli3d[usd]'
---output  folder; files of the same name in it are replaced
---decimate  reduce to at most N triangles, 16 to 10^7, with a new texture atlas (pip install 'reli3d[mesh]')
---textures  image format in glb: png, or webp, also lossless and smaller, for viewers that support EXT_texture_webp
-"""
-
 
 def parser() -> argparse.ArgumentParser:
     p = Parser(
@@ -26,13 +19,29 @@ def parser() -> argparse.ArgumentParser:
         epilog="Exit code: 0 done, 2 invalid input.",
     )
     p.add_argument("glb", type=Path, help="a GLB with one surface, such as mesh.glb of a result")
-    p.add_argument("--format", choices=FORMATS, default="glb")
-    p.add_argument("--output", type=Path, default=Path("exports"))
-    p.add_argument("--decimate", type=int, metavar="N")
+    p.add_argument(
+        "--format",
+        choices=FORMATS,
+        default="glb",
+        help="obj: with a material file and four PNG textures; usdz: needs pip install 'reli3d[usd]'",
+    )
+    p.add_argument(
+        "--output", type=Path, default=Path("exports"), help="folder; files of the same name in it are replaced"
+    )
+    p.add_argument(
+        "--decimate",
+        type=int,
+        metavar="N",
+        help="reduce to at most N triangles, 16 to 10^7, with a new texture atlas (pip install 'reli3d[mesh]')",
+    )
     p.add_argument("--texture-size", type=int, help="texels per side, 64 to 4096 (default: as in the GLB)")
-    p.add_argument("--textures", choices=("png", "webp"), default="png")
+    p.add_argument(
+        "--textures",
+        choices=("png", "webp"),
+        default="png",
+        help="image format in glb: png, or webp, also lossless and smaller, for viewers that support EXT_texture_webp",
+    )
     p.add_argument("--json", action="store_true", help="print one JSON object instead of the names")
-    p.explain(HELP)
     return p
 
 

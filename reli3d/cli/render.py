@@ -18,25 +18,6 @@ STILL = ("png", "exr")  # one file a frame
 RATE = 24  # frames a second
 QUALITIES = {"draft": ((6, 12, 2), 1), "good": ((20, 40, 4), 2), "best": ((64, 128, 16), 4)}  # samples, supersampling
 
-HELP = """
---light  environment: lat-long .hdr or .exr, upper edge +Y, horizontal center +X, +Z right of it, as in three.js,
-    model-viewer and Blender; default uniform white
---output  folder, or a file: one view as .png or .exr, or an animation as .webp, .gif or .mp4 (default renders)
---format  png (default), exr (linear radiance), or an animation: webp, gif (256 colors), mp4 (on white; pip install
-    'reli3d[video]')
---frames  number of frames of a full turn about +Y (default 1; 72 if --output is an animation)
---distance  camera distance to the object's center (default: the object fills the view)
---quality  preset of --samples and --supersampling: draft 6 12 2 and 1, good 20 40 4 and 2, best 64 128 16 and 4
---samples  samples per subpixel of the environment, GGX and cosine strategies (default: set by --quality)
---plan  TOTAL samples per subpixel, divided among the strategies to minimize the noise of the first view (relative
-    noise; with exr absolute); prints the counts to stderr
---diffuse-model  energy transmitted to the diffuse layer: conserving (default; conserves energy) or published (formula
-    of glTF viewers; a white diffuse base gains energy at grazing angles)
---tone  display transform, for all formats but exr; none: linear values
---aovs  also write EXR files of base color, material (0, roughness, metallic), normal (n / 2 + 1 / 2) and depth (depth,
-    depth, alpha)
-"""
-
 
 def parser() -> argparse.ArgumentParser:
     p = Parser(
@@ -45,32 +26,85 @@ def parser() -> argparse.ArgumentParser:
         epilog="Exit code: 0 done, 2 invalid input.  Prints the names of the files; progress goes to stderr.",
     )
     p.add_argument("glb", type=Path)
-    p.add_argument("--light", type=Path)
-    p.add_argument("--output", type=Path, default=Path("renders"))
-    p.add_argument("--format", choices=FORMATS)
-    p.add_argument("--frames", type=int)
+    p.add_argument(
+        "--light",
+        type=Path,
+        help="environment: lat-long .hdr or .exr, upper edge +Y, horizontal center +X, +Z right of it, as in three.js, "
+        "model-viewer and Blender; default uniform white",
+    )
+    p.add_argument(
+        "--output",
+        type=Path,
+        default=Path("renders"),
+        help="folder, or a file: one view as .png or .exr, or an animation as .webp, .gif or .mp4 (default renders)",
+    )
+    p.add_argument(
+        "--format",
+        choices=FORMATS,
+        help="png (default), exr (linear radiance), or an animation: webp, gif "
+        "(256 colors), mp4 (on white; pip install 'reli3d[video]')",
+    )
+    p.add_argument(
+        "--frames",
+        type=int,
+        help="number of frames of a full turn about +Y (default 1; 72 if --output is an animation)",
+    )
     p.add_argument("--turn", choices=("camera", "light"), default="camera", help="rotate the camera or the environment")
     p.add_argument("--rotate-light", dest="turn", action="store_const", const="light", help="same as --turn light")
     p.add_argument("--azimuth", type=float, default=30.0, help="azimuth of the first view in degrees, from +Z to +X")
     p.add_argument("--elevation", type=float, default=20.0, help="camera elevation in degrees, -89 to 89")
     p.add_argument("--fov", type=float, default=32.0, help="horizontal field of view in degrees")
-    p.add_argument("--distance", type=float)
+    p.add_argument(
+        "--distance", type=float, help="camera distance to the object's center (default: the object fills the view)"
+    )
     p.add_argument("--size", type=int, default=512, help="pixels per side (default 512)")
-    p.add_argument("--quality", choices=tuple(QUALITIES), default="good")
+    p.add_argument(
+        "--quality",
+        choices=tuple(QUALITIES),
+        default="good",
+        help="preset of --samples and --supersampling: draft 6 12 2 and 1, good 20 40 4 and 2, best 64 128 16 and 4",
+    )
     counts = p.add_mutually_exclusive_group()
-    counts.add_argument("--samples", type=int, nargs=3, metavar=("ENV", "GGX", "COS"))
-    counts.add_argument("--plan", type=int, metavar="TOTAL")
+    counts.add_argument(
+        "--samples",
+        type=int,
+        nargs=3,
+        metavar=("ENV", "GGX", "COS"),
+        help="samples per subpixel of the environment, GGX and cosine strategies (default: set by --quality)",
+    )
+    counts.add_argument(
+        "--plan",
+        type=int,
+        metavar="TOTAL",
+        help="TOTAL samples per subpixel, divided among the strategies to minimize the noise of the first view "
+        "(relative noise; with exr absolute); prints the counts to stderr",
+    )
     p.add_argument("--supersampling", type=int, help="subpixels per side of a pixel (default: set by --quality)")
-    p.add_argument("--diffuse-model", choices=("conserving", "published"), default="conserving")
+    p.add_argument(
+        "--diffuse-model",
+        choices=("conserving", "published"),
+        default="conserving",
+        help="energy transmitted to the diffuse layer: conserving (default; conserves energy) or published (formula of "
+        "glTF viewers; a white diffuse base gains energy at grazing angles)",
+    )
     p.add_argument("--background", choices=("transparent", "environment"), default="transparent")
-    p.add_argument("--tone", choices=("srgb", "agx", "none"), default="srgb")
+    p.add_argument(
+        "--tone",
+        choices=("srgb", "agx", "none"),
+        default="srgb",
+        help="display transform, for all formats but exr; none: linear values",
+    )
     p.add_argument("--exposure", type=float, default=0.0, help="in stops, -32 to 32, for all files but AOVs")
-    p.add_argument("--aovs", action="store_true")
+    p.add_argument(
+        "--aovs",
+        action="store_true",
+        help="also write EXR files of base color, material (0, roughness, metallic), normal (n / 2 + 1 / 2) and depth "
+        "(depth, depth, alpha)",
+    )
     p.add_argument("--no-shadows", action="store_true", help="do not trace shadow rays")
     p.add_argument("--seed", type=int, default=0, help="seed of the Monte Carlo samples")
     p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     p.add_argument("--json", action="store_true", help="print one JSON object instead of the file names")
-    p.explain(HELP)
     return p
 
 
@@ -111,8 +145,9 @@ def _check(args: argparse.Namespace) -> None:
     if not all(0 <= k <= 65536 for k in args.samples) or sum(args.samples) == 0:
         raise InputError("--samples", f"expected three counts of 0 to 65536, one above 0, got {tuple(args.samples)}")
     if args.output.suffix.lower() in UNSUPPORTED_VIDEO:
-        problem = "expected a folder or a file of type .png, .exr, .webp, .gif or .mp4"
-        raise InputError("--output", f"{problem}, got {args.output}")
+        raise InputError(
+            "--output", f"expected a folder or a file of type .png, .exr, .webp, .gif or .mp4, got {args.output}"
+        )
     if args.format == "mp4":
         if args.size % 2:
             raise InputError("--size", f"expected an even number of pixels for mp4, got {args.size}")

@@ -24,19 +24,6 @@ OF_SMALL = (*OF_NETWORK, "points", "pyramid_rate", "maps", "material_bins")
 OF_CONFIG = ("image_size", "patch", "targets", "lobes", "resolution", "samples", "shadows")  # of a StageConfig
 OF_PAPER = (*OF_NETWORK, *OF_CONFIG, "preset", "prior", "perceptual", "checkpointing", "shard")
 
-HELP = """
-data  folders of samples; for the stages of the ReLi3D paper also captures, shards; for light_prior environment maps,
-    .npz
---stage  pixels, small: the small network, its 2D U-Net alone or all of it; volume, gaussians, surface, monte_carlo: the
-    paper's network of preset tiny; volume, gaussians128, gaussians256, gaussians512, monte_carlo: of preset official;
-    light_prior: the environment decoder alone
---weights  initial weights: the averaged weights of a checkpoint (state.pt of this or the previous stage), a safetensors
-    file, or small (default: random)
---pyramid-rate  multiplier of the learning rate of the 2D U-Net; 0.1 after stage pixels
---material-bins  roughness and metallic of pixels are distributions over N values (8); default as in the weights
---prior  checkpoint of stage light_prior; adds a loss with its frozen environment decoder
-"""
-
 
 def parser() -> argparse.ArgumentParser:
     p = Parser(
@@ -45,10 +32,27 @@ def parser() -> argparse.ArgumentParser:
         argument_default=argparse.SUPPRESS,
     )
     # torchrun reads the whole line first: an option that is the beginning of one of its own would be ambiguous
-    p.add_argument("data", type=Path, nargs="*", default=[])
+    p.add_argument(
+        "data",
+        type=Path,
+        nargs="*",
+        default=[],
+        help="folders of samples; for the stages of the ReLi3D paper also captures, shards; for light_prior "
+        "environment maps, .npz",
+    )
     p.add_argument("output", type=Path, help="folder of the checkpoint, the log, the curves and validation images")
-    p.add_argument("--stage", default="small")
-    p.add_argument("--weights")
+    p.add_argument(
+        "--stage",
+        default="small",
+        help="pixels, small: the small network, its 2D U-Net alone or all of it; volume, gaussians, surface, "
+        "monte_carlo: the paper's network of preset tiny; volume, gaussians128, gaussians256, gaussians512, "
+        "monte_carlo: of preset official; light_prior: the environment decoder alone",
+    )
+    p.add_argument(
+        "--weights",
+        help="initial weights: the averaged weights of a checkpoint (state.pt of this or the previous stage), a "
+        "safetensors file, or small (default: random)",
+    )
     p.add_argument("--validation", type=Path, help="folder of held-out objects, reconstructed at every checkpoint")
     p.add_argument("--export", type=Path, help="write the averaged weights of the checkpoint to this file and exit")
     p.add_argument("--license", help="license of the exported weights, stored in the file")
@@ -65,13 +69,25 @@ def parser() -> argparse.ArgumentParser:
     loop.add_argument("--tensorboard", type=Path, metavar="DIR", help="also write event files to this folder")
     small = p.add_argument_group("stages pixels and small")
     small.add_argument("--points", type=int, help="volume points per object")
-    small.add_argument("--pyramid-rate", type=float, metavar="TIMES")
-    small.add_argument("--material-bins", type=int, metavar="N")
+    small.add_argument(
+        "--pyramid-rate",
+        type=float,
+        metavar="TIMES",
+        help="multiplier of the learning rate of the 2D U-Net; 0.1 after stage pixels",
+    )
+    small.add_argument(
+        "--material-bins",
+        type=int,
+        metavar="N",
+        help="roughness and metallic of pixels are distributions over N values (8); default as in the weights",
+    )
     small.add_argument("--maps", type=Path, help="environment maps, .npz, under which half of the samples are relit")
     paper = p.add_argument_group("stages of the ReLi3D paper's network, and --image-size of pixels")
     paper.add_argument("--image-size", type=int, help="pixels per side; for stage pixels 64 (default), 128 or 256")
     paper.add_argument("--preset", choices=("tiny", "official"))
-    paper.add_argument("--prior", type=Path)
+    paper.add_argument(
+        "--prior", type=Path, help="checkpoint of stage light_prior; adds a loss with its frozen environment decoder"
+    )
     paper.add_argument("--perceptual", choices=("gradients", "lpips"))
     paper.add_argument("--checkpointing", action="store_true", help="recompute the trunk's layers in the backward pass")
     paper.add_argument("--shard", action="store_true", help="divide the trunk among the processes of torchrun (FSDP)")
@@ -79,7 +95,6 @@ def parser() -> argparse.ArgumentParser:
         paper.add_argument(f"--{name}", type=int)
     paper.add_argument("--samples", type=int, nargs=3, metavar=("LIGHT", "NORMALS", "COSINE"))
     paper.add_argument("--shadows", action=argparse.BooleanOptionalAction)
-    p.explain(HELP)
     return p
 
 

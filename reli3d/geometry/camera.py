@@ -47,8 +47,10 @@ class Camera:
         check("c2w", self.c2w, last=4)
         check("intrinsics", self.intrinsics, last=4, like=self.c2w)
         if self.c2w.ndim < 2 or self.c2w.shape[-2] != 4 or self.c2w.shape[:-2] != self.intrinsics.shape[:-1]:
-            problem = "c2w: expected (..., 4, 4) with the batch axes of intrinsics"
-            raise ValueError(f"{problem}, got {tuple(self.c2w.shape)} and {tuple(self.intrinsics.shape)}")
+            raise ValueError(
+                "c2w: expected (..., 4, 4) with the batch axes of intrinsics, "
+                f"got {tuple(self.c2w.shape)} and {tuple(self.intrinsics.shape)}"
+            )
         if self.width < 1 or self.height < 1:
             raise ValueError(f"width, height: expected at least 1, got {self.width}, {self.height}")
 

@@ -21,8 +21,9 @@ def signed_distance(vertices: Tensor, faces: Tensor, points: Tensor) -> Tensor:
     if len(faces) == 0:
         raise ValueError("faces: expected at least one, got none")
     if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
-        problem = f"faces: expected indices 0 to {len(vertices) - 1}"
-        raise ValueError(f"{problem}, got {int(faces.min())} to {int(faces.max())}")
+        raise ValueError(
+            f"faces: expected indices 0 to {len(vertices) - 1}, got {int(faces.min())} to {int(faces.max())}"
+        )
     if not torch.isfinite(vertices).all():
         raise ValueError("vertices: expected finite coordinates, got NaN or infinity")
     vertices, faces, points = vertices.detach().contiguous(), faces.contiguous(), points.detach().contiguous()

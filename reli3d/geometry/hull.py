@@ -83,8 +83,9 @@ def mirror_residual(
     check("offset", offset, like=points)
     check("known", known, like=points, dtype=torch.bool)
     if points.ndim != 3 or known.shape != points.shape[:2]:
-        problem = "points, known: expected (R, D, 3) and (R, D)"
-        raise ValueError(f"{problem}, got {tuple(points.shape)}, {tuple(known.shape)}")
+        raise ValueError(
+            f"points, known: expected (R, D, 3) and (R, D), got {tuple(points.shape)}, {tuple(known.shape)}"
+        )
     if normal.ndim != 2 or tuple(offset.shape) != normal.shape[:1]:
         raise ValueError(f"normal, offset: expected (P, 3) and (P,), got {tuple(normal.shape)}, {tuple(offset.shape)}")
     if not most >= 0.0:

@@ -23,8 +23,9 @@ def sparse_sdf(known: Tensor, near: Tensor, evaluate: Callable[[Tensor], Tensor]
     unless ``near`` is bool.
     """
     if known.ndim != 3 or min(known.shape) < 3 or near.shape != known.shape:
-        problem = "known, near: expected one shape (X, Y, Z) of 3 or more"
-        raise ValueError(f"{problem}, got {tuple(known.shape)}, {tuple(near.shape)}")
+        raise ValueError(
+            f"known, near: expected one shape (X, Y, Z) of 3 or more, got {tuple(known.shape)}, {tuple(near.shape)}"
+        )
     if near.dtype != torch.bool:
         raise TypeError(f"near: expected torch.bool, got {near.dtype}")
     sdf, done = known.clone(), torch.zeros_like(near)

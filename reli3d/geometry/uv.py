@@ -226,8 +226,9 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
         try:
             done = subprocess.run([sys.executable, "-c", XATLAS, job, result], capture_output=True, timeout=timeout_s)
         except subprocess.TimeoutExpired:
-            problem = f"unwrap_xatlas: no atlas of {len(mesh.faces)} faces in {timeout_s:g} s"
-            raise TimeoutError(f"{problem}; use unwrap, or raise timeout_s") from None
+            raise TimeoutError(
+                f"unwrap_xatlas: no atlas of {len(mesh.faces)} faces in {timeout_s:g} s; use unwrap, or raise timeout_s"
+            ) from None
         if done.returncode != 0:
             tail = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
             raise RuntimeError(f"unwrap_xatlas: xatlas ended with code {done.returncode} ({tail[0]}); use unwrap")

@@ -266,8 +266,10 @@ class Materials:
         except InputError:
             raise
         except Exception as error:  # on a broken file decoders raise almost anything: struct.error, IndexError ...
-            problem = f"{where}: expected a PNG, JPEG or WebP image, got {shown(str(error))}"
-            raise InputError(self.document.path, f"{problem}; save the image again") from None
+            raise InputError(
+                self.document.path,
+                f"{where}: expected a PNG, JPEG or WebP image, got {shown(str(error))}; save the image again",
+            ) from None
         self.images[index] = torch.from_numpy(pixels)
         return self.images[index]
 

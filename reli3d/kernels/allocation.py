@@ -13,10 +13,15 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=
 
 @wp.kernel
 def pilot_kernel(
-    start: int, points: Points, light: Light, plan: Plan,
-    origins: wp.array2d[wp.vec3], directions: wp.array2d[wp.vec3], values: wp.array2d[wp.vec3],  # out
+    start: int,
+    points: Points,
+    light: Light,
+    plan: Plan,
+    origins: wp.array2d[wp.vec3],  # out
+    directions: wp.array2d[wp.vec3],  # out
+    values: wp.array2d[wp.vec3],  # out
     densities: wp.array2d[wp.vec3],  # out
-):  # fmt: skip
+):
     """Each sample's shadow ray, its value over q, and the densities of environment, visible normals and cosine over q.
 
     q is the sum of counts times densities of the plan, whose visible normals are not in pairs.  Values and densities

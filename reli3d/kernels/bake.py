@@ -68,11 +68,17 @@ def centers(a: wp.vec2, b: wp.vec2, c: wp.vec2, box: wp.vec4i) -> wp.vec4i:
 
 @wp.kernel
 def texels_kernel(
-    start: int, tiles: Tiles, segment_start: wp.array[wp.int32], segment_list: wp.array[wp.int32],
-    segments: wp.array[wp.int32], reach: float,
-    distance: wp.array2d[float],  # scratch
-    face: wp.array2d[wp.int32], bary: wp.array2d[wp.vec2],  # out
-):  # fmt: skip
+    start: int,
+    tiles: Tiles,
+    segment_start: wp.array[wp.int32],
+    segment_list: wp.array[wp.int32],
+    segments: wp.array[wp.int32],
+    reach: float,
+    # scratch
+    distance: wp.array2d[float],
+    face: wp.array2d[wp.int32],  # out
+    bary: wp.array2d[wp.vec2],  # out
+):
     """Fill tile ``i``: the first face over a texel's center; else the nearest border segment within ``reach`` texels.
 
     ``segments`` holds 3 * face + corner of each edge on a border.  ``bary`` weighs vertices 1 and 2.
@@ -141,9 +147,11 @@ def texels_kernel(
 
 @wp.kernel
 def nearest_row_kernel(
-    start: int, valid: wp.array2d[wp.uint8], strip: int,
+    start: int,
+    valid: wp.array2d[wp.uint8],
+    strip: int,
     row: wp.array2d[wp.int32],  # out
-):  # fmt: skip
+):
     """Row of the nearest valid texel of the same column, the upper of two; ``-NO_SITE_ROWS`` without one.
 
     A thread works on ``strip`` columns: contiguous reads.
@@ -173,10 +181,14 @@ def nearest_row_kernel(
 
 @wp.kernel
 def nearest_texel_kernel(
-    start: int, row: wp.array2d[wp.int32],
-    site: wp.array2d[wp.int32], border: wp.array2d[float],  # scratch
-    source: wp.array2d[wp.int32], square: wp.array2d[float],  # out
-):  # fmt: skip
+    start: int,
+    row: wp.array2d[wp.int32],
+    # scratch
+    site: wp.array2d[wp.int32],
+    border: wp.array2d[float],
+    source: wp.array2d[wp.int32],  # out
+    square: wp.array2d[float],  # out
+):
     """Flat index and squared distance of the nearest valid texel for every texel of row ``i``; -1 and inf without one.
 
     A thread works on one row.

@@ -84,10 +84,15 @@ def pdf_lobes(facet: Facet, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
 
 @wp.kernel
 def eval_bsdf_kernel(
-    start: int, wo: wp.array[wp.vec3], wi: wp.array[wp.vec3], base_color: wp.array[wp.vec3], alpha: wp.array[float],
-    metallic: wp.array[float], conserving: int,
+    start: int,
+    wo: wp.array[wp.vec3],
+    wi: wp.array[wp.vec3],
+    base_color: wp.array[wp.vec3],
+    alpha: wp.array[float],
+    metallic: wp.array[float],
+    conserving: int,
     value: wp.array[wp.vec3],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     value[i] = wp.vec3(0.0, 0.0, 0.0)
     if wo[i][2] > COS_MIN and wi[i][2] > COS_MIN:
@@ -98,9 +103,12 @@ def eval_bsdf_kernel(
 
 @wp.kernel(enable_backward=False)
 def pdf_lobes_kernel(
-    start: int, wo: wp.array[wp.vec3], wi: wp.array[wp.vec3], alpha: wp.array[float],
+    start: int,
+    wo: wp.array[wp.vec3],
+    wi: wp.array[wp.vec3],
+    alpha: wp.array[float],
     pdf: wp.array[wp.vec3],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     pdf[i] = wp.vec3(0.0, 0.0, 0.0)
     if wo[i][2] > COS_MIN and wi[i][2] > COS_MIN:

@@ -50,12 +50,18 @@ def out_of_block(cell: wp.vec3, along: wp.vec3, block: wp.vec3i) -> float:
 
 @wp.kernel
 def residual_kernel(
-    start: int, sdf: wp.array3d[float],
+    start: int,
+    sdf: wp.array3d[float],
     lowest: wp.array3d[float],  # of each block of BLOCK_CELLS cells a side, border included
-    distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4], radius: float, depth: float,
-    field_max: float, stride: int,
+    distance: wp.array3d[float],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+    radius: float,
+    depth: float,
+    field_max: float,
+    stride: int,
     residual: wp.array3d[float],  # out: (V, H // stride, W // stride)
-):  # fmt: skip
+):
     """Coverage residual of a pixel: the amount by which the minimum of the field along its ray exceeds ``-depth``.
 
     0 outside the silhouette, and for minima of at least ``field_max``.
@@ -101,10 +107,17 @@ def residual_kernel(
 
 @wp.kernel
 def lower_kernel(
-    start: int, sdf: wp.array3d[float], bound: wp.array3d[float], residual: wp.array3d[float], c2w: wp.array[wp.mat44],
-    intrinsics: wp.array[wp.vec4], radius: float, field_max: float, stride: int,
+    start: int,
+    sdf: wp.array3d[float],
+    bound: wp.array3d[float],
+    residual: wp.array3d[float],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+    radius: float,
+    field_max: float,
+    stride: int,
     lowered: wp.array3d[float],  # out
-):  # fmt: skip
+):
     """Field minus the largest coverage residual of the rays through a point, clamped from below to ``bound``."""
     n = start + wp.tid()
     z = n % sdf.shape[2]

@@ -39,8 +39,11 @@ def signed_distance(mesh: wp.uint64, point: wp.vec3, reach: float) -> float:
 
 @wp.kernel
 def signed_distance_kernel(
-    start: int, mesh: wp.uint64, points: wp.array[wp.vec3], reach: float,
+    start: int,
+    mesh: wp.uint64,
+    points: wp.array[wp.vec3],
+    reach: float,
     distance: wp.array[float],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     distance[i] = signed_distance(mesh, points[i], reach)

@@ -46,9 +46,15 @@ return -1;
 """
 )
 def first_hit(
-    intersect1: wp.uint64, scene: wp.uint64, o: wp.vec3, d: wp.vec3, limit: float, i: int, t: wp.array[float],
+    intersect1: wp.uint64,
+    scene: wp.uint64,
+    o: wp.vec3,
+    d: wp.vec3,
+    limit: float,
+    i: int,
+    t: wp.array[float],
     bary: wp.array[wp.vec2],
-) -> int:  # fmt: skip
+) -> int:
     """Nearest face at t in [0, limit], -1 for none; a hit's t and the weights of vertices 1 and 2 go to place ``i``."""
     ...
 
@@ -96,9 +102,14 @@ for (int k = first; k < first + count;) {
 #endif
 """)
 def block_rays(
-    occluded16: wp.uint64, scene: wp.uint64, origins: wp.array[wp.vec3], directions: wp.array[wp.vec3], first: int,
-    count: int, t_max: wp.array[float],
-):  # fmt: skip
+    occluded16: wp.uint64,
+    scene: wp.uint64,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    first: int,
+    count: int,
+    t_max: wp.array[float],
+):
     """Set ``t_max`` to -1 for those of ``count`` valid rays that meet anything before it; those below 0 are left out.
 
     In packets of 16, which pays for rays that leave from one place.
@@ -141,9 +152,14 @@ for (int i = 0; i < count; i++) {
 #endif
 """)
 def ray_keys(
-    origins: wp.array[wp.vec3], directions: wp.array[wp.vec3], low: wp.vec3, per_cell: wp.vec3, first: int, count: int,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    low: wp.vec3,
+    per_cell: wp.vec3,
+    first: int,
+    count: int,
     key: wp.array[wp.int16],
-):  # fmt: skip
+):
     """16-bit sort keys, equal for coherent rays: the direction's cell of 32 x 32 on an octahedron in Morton order
     (Morton 1966), then the origin's cell of 4 x 4 x 4 above ``low``.
 
@@ -166,10 +182,16 @@ def stretch_of(direction: wp.vec3) -> float:
 
 @wp.kernel
 def embree_closest_kernel(
-    start: int, intersect1: wp.uint64, scene: wp.uint64, origins: wp.array[wp.vec3], directions: wp.array[wp.vec3],
+    start: int,
+    intersect1: wp.uint64,
+    scene: wp.uint64,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
     t_max: wp.array[float],
-    face: wp.array[wp.int32], t: wp.array[float], bary: wp.array[wp.vec2],  # out
-):  # fmt: skip
+    face: wp.array[wp.int32],  # out
+    t: wp.array[float],  # out
+    bary: wp.array[wp.vec2],  # out
+):
     i = start + wp.tid()
     o = origins[i]
     d = directions[i]
@@ -188,10 +210,14 @@ def embree_closest_kernel(
 
 @wp.kernel
 def embree_occluded_kernel(
-    start: int, occluded1: wp.uint64, scene: wp.uint64, origins: wp.array[wp.vec3], directions: wp.array[wp.vec3],
+    start: int,
+    occluded1: wp.uint64,
+    scene: wp.uint64,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
     t_max: wp.array[float],
     occluded: wp.array[wp.bool],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     o = origins[i]
     d = directions[i]
@@ -204,9 +230,13 @@ def embree_occluded_kernel(
 
 @wp.kernel
 def embree_unoccluded_kernel(
-    start: int, occluded16: wp.uint64, scene: wp.uint64, origins: wp.array[wp.vec3], directions: wp.array[wp.vec3],
+    start: int,
+    occluded16: wp.uint64,
+    scene: wp.uint64,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
     t_max: wp.array[float],  # in and out
-):  # fmt: skip
+):
     """``t_max`` becomes -1 where anything is met up to it; :data:`GROUP` rays a thread."""
     first = (start + wp.tid()) * GROUP
     block_rays(occluded16, scene, origins, directions, first, wp.min(GROUP, t_max.shape[0] - first), t_max)
@@ -214,9 +244,13 @@ def embree_unoccluded_kernel(
 
 @wp.kernel
 def ray_key_kernel(
-    start: int, origins: wp.array[wp.vec3], directions: wp.array[wp.vec3], low: wp.vec3, per_cell: wp.vec3,
+    start: int,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    low: wp.vec3,
+    per_cell: wp.vec3,
     key: wp.array[wp.int16],  # out
-):  # fmt: skip
+):
     """:data:`RUN` rays a thread."""
     first = (start + wp.tid()) * RUN
     ray_keys(origins, directions, low, per_cell, first, wp.min(RUN, key.shape[0] - first), key)

@@ -102,9 +102,12 @@ class MapSample:
 
 @wp.func
 def sample_envmap(
-    rows: wp.array2d[float], columns: wp.array2d[float], row_guide: wp.array2d[wp.int32],
-    column_guide: wp.array2d[wp.int32], u: wp.vec2,
-) -> MapSample:  # fmt: skip
+    rows: wp.array2d[float],
+    columns: wp.array2d[float],
+    row_guide: wp.array2d[wp.int32],
+    column_guide: wp.array2d[wp.int32],
+    u: wp.vec2,
+) -> MapSample:
     """Point of the map for uniform ``u`` in [0, 1)^2; density :func:`pdf_envmap_uv`.
 
     rows: ``(2, H + 1)``, CDF of the rows and height of their edges; columns: ``(H, W + 1)`` CDF within each row.
@@ -143,18 +146,25 @@ def pdf_envmap_uv(density: wp.array2d[float], uv: wp.vec2) -> float:
 
 @wp.kernel
 def lookup_envmap_kernel(
-    start: int, radiance: wp.array2d[wp.vec3], directions: wp.array[wp.vec3],
+    start: int,
+    radiance: wp.array2d[wp.vec3],
+    directions: wp.array[wp.vec3],
     out: wp.array[wp.vec3],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     out[i] = lookup_envmap(radiance, directions[i])
 
 
 @wp.kernel
 def lookup_adjoint_kernel(
-    start: int, first: int, radiance: wp.array2d[wp.vec3], directions: wp.array[wp.vec3], g_out: wp.array[wp.vec3],
-    g_radiance: wp.array2d[wp.vec3], g_directions: wp.array[wp.vec3],  # out
-):  # fmt: skip
+    start: int,
+    first: int,
+    radiance: wp.array2d[wp.vec3],
+    directions: wp.array[wp.vec3],
+    g_out: wp.array[wp.vec3],
+    g_radiance: wp.array2d[wp.vec3],  # out
+    g_directions: wp.array[wp.vec3],  # out
+):
     """Adjoints of the lookups from ``first``; an output without rows is left out.  ``g_radiance`` is added to.
 
     u and v are angles: their derivatives are those of atan2(z, x) / 2 pi and atan2(sqrt(x^2 + z^2), y) / pi.
@@ -186,10 +196,16 @@ def lookup_adjoint_kernel(
 
 @wp.kernel
 def sample_envmap_kernel(
-    start: int, rows: wp.array2d[float], columns: wp.array2d[float], row_guide: wp.array2d[wp.int32],
-    column_guide: wp.array2d[wp.int32], density: wp.array2d[float], u: wp.array[wp.vec2],
-    directions: wp.array[wp.vec3], pdf: wp.array[float],  # out
-):  # fmt: skip
+    start: int,
+    rows: wp.array2d[float],
+    columns: wp.array2d[float],
+    row_guide: wp.array2d[wp.int32],
+    column_guide: wp.array2d[wp.int32],
+    density: wp.array2d[float],
+    u: wp.array[wp.vec2],
+    directions: wp.array[wp.vec3],  # out
+    pdf: wp.array[float],  # out
+):
     i = start + wp.tid()
     drawn = sample_envmap(rows, columns, row_guide, column_guide, u[i])
     directions[i] = drawn.direction
@@ -198,8 +214,10 @@ def sample_envmap_kernel(
 
 @wp.kernel
 def pdf_envmap_kernel(
-    start: int, density: wp.array2d[float], directions: wp.array[wp.vec3],
+    start: int,
+    density: wp.array2d[float],
+    directions: wp.array[wp.vec3],
     pdf: wp.array[float],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     pdf[i] = pdf_envmap_uv(density, direction_to_uv(directions[i]))

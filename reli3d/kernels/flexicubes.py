@@ -148,9 +148,14 @@ def column_bits(sdf: wp.array[float], index: int, step_x: int, step_y: int, has_
 
 @wp.kernel
 def classify_kernel(
-    start: int, sdf: wp.array[float], nx: int, ny: int, nz: int,
-    codes: wp.array[wp.uint8], crossed: wp.array[wp.uint8],  # out
-):  # fmt: skip
+    start: int,
+    sdf: wp.array[float],
+    nx: int,
+    ny: int,
+    nz: int,
+    codes: wp.array[wp.uint8],  # out
+    crossed: wp.array[wp.uint8],  # out
+):
     """Case of each cube, and the crossed edges of each vertex.
 
     codes: the case, a bit for each inside corner; 0 for all cubes without a sign change.  crossed: which edges of the
@@ -192,10 +197,17 @@ def classify_kernel(
 
 @wp.kernel
 def resolve_kernel(
-    start: int, cells: wp.array[wp.int32], codes: wp.array[wp.uint8], neighbor: wp.array[wp.int32],
-    count: wp.array[wp.int32], ny: int, nz: int,
-    resolved: wp.array[wp.int32], counts: wp.array[wp.int32], slot: wp.array[wp.int32],  # out
-):  # fmt: skip
+    start: int,
+    cells: wp.array[wp.int32],
+    codes: wp.array[wp.uint8],
+    neighbor: wp.array[wp.int32],
+    count: wp.array[wp.int32],
+    ny: int,
+    nz: int,
+    resolved: wp.array[wp.int32],  # out
+    counts: wp.array[wp.int32],  # out
+    slot: wp.array[wp.int32],  # out
+):
     """Resolved case of a surface cube: the complement of its case if it shares its ambiguous face with a cube that is
     ambiguous at the same face (C16 and C19 of Wenger 2013), else the case itself.
     """
@@ -223,10 +235,16 @@ def resolve_kernel(
 
 @wp.kernel
 def dual_vertex_kernel(
-    start: int, cube: wp.array[wp.int32], group: wp.array[wp.int32], surface: SurfaceCubes, tables: Tables, grid: Grid,
-    weights: Weights, scale: wp.vec3,
+    start: int,
+    cube: wp.array[wp.int32],
+    group: wp.array[wp.int32],
+    surface: SurfaceCubes,
+    tables: Tables,
+    grid: Grid,
+    weights: Weights,
+    scale: wp.vec3,
     vertices: wp.array[wp.vec3],  # out
-):  # fmt: skip
+):
     """Dual vertex ``group`` of surface cube ``cube``: the mean, weighted by beta, of the zero crossings on its edges.
 
     A group is a set of crossed edges of a cube that share one dual vertex.  NaN if a weight of these edges is not
@@ -261,10 +279,16 @@ def dual_vertex_kernel(
 
 @wp.kernel
 def quad_kernel(
-    start: int, origin: wp.array[wp.int32], direction: wp.array[wp.int32], surface: SurfaceCubes, tables: Tables,
-    grid: Grid, gamma: wp.array[float],
-    quads: wp.array[wp.int32], split: wp.array[float],  # out
-):  # fmt: skip
+    start: int,
+    origin: wp.array[wp.int32],
+    direction: wp.array[wp.int32],
+    surface: SurfaceCubes,
+    tables: Tables,
+    grid: Grid,
+    gamma: wp.array[float],
+    quads: wp.array[wp.int32],  # out
+    split: wp.array[float],  # out
+):
     """The quad of a crossed edge: the dual vertices of its four cubes, counter-clockwise seen from outside.
 
     origin: the vertex to which the edge belongs.  direction: 0 for the edge along -y, 1 along z, 2 along x, the bits of

@@ -20,13 +20,18 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 
 @wp.kernel
 def dual_vertex_adjoint_kernel(
-    start: int, surface: SurfaceCubes, tables: Tables, grid: Grid, weights: Weights, scale: wp.vec3,
+    start: int,
+    surface: SurfaceCubes,
+    tables: Tables,
+    grid: Grid,
+    weights: Weights,
+    scale: wp.vec3,
     g_vertices: wp.array[wp.vec3],
     g_sdf: wp.array[float],  # out, zeroed
     g_shift: wp.array[wp.vec3],  # out, zeroed
     g_alpha: wp.array[float],  # out, zeroed
     g_beta: wp.array[float],  # out, zeroed
-):  # fmt: skip
+):
     """One thread per surface cube, which writes its own 8 entries of g_sdf, g_shift, g_alpha and its 12 of g_beta.
 
     In float64, because differences between crossings and their mean, and between the ends of an edge, cancel.

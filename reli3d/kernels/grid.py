@@ -66,10 +66,12 @@ def value_or_zero(values: wp.array3d[float], i: int, j: int, k: int) -> float:
 
 @wp.kernel(enable_backward=False)
 def weighted_laplacian_kernel(
-    start: int, field: wp.array3d[float], weight: wp.array3d[float],
+    start: int,
+    field: wp.array3d[float],
+    weight: wp.array3d[float],
     product: wp.array3d[float],  # out: weight * laplacian, 0 at the border
     total: wp.array[float],  # out: sum of weight * laplacian**2 over a row of the grid
-):  # fmt: skip
+):
     row = start + wp.tid()
     i = row // field.shape[1]
     j = row % field.shape[1]

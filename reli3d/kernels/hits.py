@@ -30,9 +30,13 @@ def wrap(k: int, size: int) -> int:
 
 @wp.kernel
 def interpolate_kernel(
-    start: int, values: wp.array[Any], faces: wp.array2d[wp.int32], face: wp.array[wp.int32], bary: wp.array[wp.vec2],
+    start: int,
+    values: wp.array[Any],
+    faces: wp.array2d[wp.int32],
+    face: wp.array[wp.int32],
+    bary: wp.array[wp.vec2],
     out: wp.array[Any],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     f = face[i]
     if f >= 0:
@@ -50,9 +54,12 @@ INTERPOLATE = {  # by the number of channels
 
 @wp.kernel
 def hit_normal_kernel(
-    start: int, vertices: wp.array[wp.vec3], faces: wp.array2d[wp.int32], face: wp.array[wp.int32],
+    start: int,
+    vertices: wp.array[wp.vec3],
+    faces: wp.array2d[wp.int32],
+    face: wp.array[wp.int32],
     out: wp.array[wp.vec3],  # out
-):  # fmt: skip
+):
     """Outward normal of a counter-clockwise face."""
     i = start + wp.tid()
     f = face[i]
@@ -67,10 +74,17 @@ def hit_normal_kernel(
 
 @wp.kernel
 def reevaluate_kernel(
-    start: int, vertices: wp.array[wp.vec3], faces: wp.array2d[wp.int32], face: wp.array[wp.int32],
-    origins: wp.array[wp.vec3], directions: wp.array[wp.vec3], hit_t: wp.array[float], hit_bary: wp.array[wp.vec2],
-    t: wp.array[float], bary: wp.array[wp.vec2],  # out
-):  # fmt: skip
+    start: int,
+    vertices: wp.array[wp.vec3],
+    faces: wp.array2d[wp.int32],
+    face: wp.array[wp.int32],
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    hit_t: wp.array[float],
+    hit_bary: wp.array[wp.vec2],
+    t: wp.array[float],  # out
+    bary: wp.array[wp.vec2],  # out
+):
     """Ray against the plane of a known face.  Moller and Trumbore 1997, without their early exits.
 
     A miss, and a face seen edge-on, keep the values of the ray query, without gradient."""
@@ -95,9 +109,11 @@ def reevaluate_kernel(
 
 @wp.kernel
 def sample_texture_kernel(
-    start: int, texture: wp.array2d[wp.vec3], uv: wp.array[wp.vec2],
+    start: int,
+    texture: wp.array2d[wp.vec3],
+    uv: wp.array[wp.vec2],
     out: wp.array[wp.vec3],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     height = texture.shape[0]
     width = texture.shape[1]

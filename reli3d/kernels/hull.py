@@ -57,10 +57,14 @@ def distance_to_hull(
 
 @wp.kernel
 def hull_distance_kernel(
-    start: int, points: wp.array[wp.vec3], distance: wp.array3d[float], c2w: wp.array[wp.mat44],
-    intrinsics: wp.array[wp.vec4], far: float,
+    start: int,
+    points: wp.array[wp.vec3],
+    distance: wp.array3d[float],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+    far: float,
     hull: wp.array[float],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     hull[i] = distance_to_hull(points[i], distance, c2w, intrinsics, far)
 
@@ -72,9 +76,12 @@ def mirror_residual_kernel(
     known: wp.array2d[bool],  # (R, D) whether the point is in the hull
     normal: wp.array[wp.vec3],  # (P,) of planes, unit
     offset: wp.array[float],  # (P,)
-    most: float, distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4],
+    most: float,
+    distance: wp.array3d[float],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
     residual: wp.array2d[float],  # out: (P, R)
-):  # fmt: skip
+):
     """Least distance outside the hull of the mirror images of a ray's known points, at most ``most``."""
     i = start + wp.tid()
     plane = i // points.shape[0]
@@ -93,10 +100,15 @@ def mirror_residual_kernel(
 
 @wp.kernel
 def hull_span_kernel(
-    start: int, origins: wp.array[wp.vec3], directions: wp.array[wp.vec3], radius: float, distance: wp.array3d[float],
-    c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4],
+    start: int,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    radius: float,
+    distance: wp.array3d[float],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
     span: wp.array[wp.vec2],  # out
-):  # fmt: skip
+):
     """Sphere tracing from both ends of a ray's chord in the sphere of ``radius`` around the origin."""
     i = start + wp.tid()
     o = origins[i]
@@ -240,10 +252,13 @@ def column_kernel(
 
 @wp.kernel
 def row_kernel(
-    start: int, row: wp.array3d[float],
-    apex: wp.array3d[wp.int32], begin: wp.array3d[float],  # scratch
+    start: int,
+    row: wp.array3d[float],
+    # scratch
+    apex: wp.array3d[wp.int32],
+    begin: wp.array3d[float],
     nearest: wp.array3d[wp.int32],  # out
-):  # fmt: skip
+):
     """Column of the nearest crossing, given the nearest one of each column in ``row``; -1 without any.  One thread per
     row.
     """
@@ -263,10 +278,15 @@ def row_kernel(
 
 @wp.kernel
 def mask_distance_kernel(
-    start: int, mask: wp.array3d[float], row: wp.array3d[float], nearest_x: wp.array3d[wp.int32],
-    column: wp.array3d[float], nearest_y: wp.array3d[wp.int32], far: float,
+    start: int,
+    mask: wp.array3d[float],
+    row: wp.array3d[float],
+    nearest_x: wp.array3d[wp.int32],
+    column: wp.array3d[float],
+    nearest_y: wp.array3d[wp.int32],
+    far: float,
     distance: wp.array3d[float],  # out
-):  # fmt: skip
+):
     """Signed distance to the contour, ``far`` without one.
 
     The nearest crossing with any column (``row``, ``nearest_x``) or row (``column``, ``nearest_y``, both transposed) is

@@ -117,9 +117,12 @@ def pdf_vndf_mirrored(facet: Facet, wo: wp.vec3) -> float:
 
 @wp.kernel
 def sample_ggx_vndf_kernel(
-    start: int, wo: wp.array[wp.vec3], alpha: wp.array[float], u: wp.array[wp.vec2],
+    start: int,
+    wo: wp.array[wp.vec3],
+    alpha: wp.array[float],
+    u: wp.array[wp.vec2],
     wm: wp.array[wp.vec3],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     width = wp.max(alpha[i], ALPHA_MIN)
     wm[i] = sample_ggx_vndf(stretch_view(wo[i], width), width, u[i])
@@ -127,8 +130,11 @@ def sample_ggx_vndf_kernel(
 
 @wp.kernel
 def pdf_ggx_vndf_kernel(
-    start: int, wo: wp.array[wp.vec3], alpha: wp.array[float], wm: wp.array[wp.vec3],
+    start: int,
+    wo: wp.array[wp.vec3],
+    alpha: wp.array[float],
+    wm: wp.array[wp.vec3],
     pdf: wp.array[float],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     pdf[i] = pdf_ggx_vndf(wo[i], wp.max(alpha[i], ALPHA_MIN), wm[i])

@@ -69,9 +69,15 @@ def gradient_noise(q: wp.vec3, seed: wp.uint32) -> wp.vec4:
 
 @wp.kernel
 def fbm_kernel(
-    start: int, points: wp.array[wp.vec3], octaves: int, gain: float, ridged: int, seed: int,
-    value: wp.array[float], gradient: wp.array[wp.vec3],  # out
-):  # fmt: skip
+    start: int,
+    points: wp.array[wp.vec3],
+    octaves: int,
+    gain: float,
+    ridged: int,
+    seed: int,
+    value: wp.array[float],  # out
+    gradient: wp.array[wp.vec3],  # out
+):
     i = start + wp.tid()
     q = points[i]
     total = wp.float32(0.0)
@@ -93,9 +99,13 @@ def fbm_kernel(
 
 @wp.kernel
 def cells_kernel(
-    start: int, points: wp.array[wp.vec3], seed: int,
-    distance: wp.array[wp.vec2], cell: wp.array[float], gradient: wp.array[wp.vec3],  # out
-):  # fmt: skip
+    start: int,
+    points: wp.array[wp.vec3],
+    seed: int,
+    distance: wp.array[wp.vec2],  # out
+    cell: wp.array[float],  # out
+    gradient: wp.array[wp.vec3],  # out
+):
     i = start + wp.tid()
     q = points[i]
     base = wp.vec3(wp.floor(q[0]), wp.floor(q[1]), wp.floor(q[2]))

@@ -45,9 +45,15 @@ def hit_occluded(mesh: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: fl
 
 @wp.kernel
 def closest_kernel(
-    start: int, mesh: wp.uint64, origins: wp.array[wp.vec3], directions: wp.array[wp.vec3], t_max: wp.array[float],
-    face: wp.array[wp.int32], t: wp.array[float], bary: wp.array[wp.vec2],  # out
-):  # fmt: skip
+    start: int,
+    mesh: wp.uint64,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    t_max: wp.array[float],
+    face: wp.array[wp.int32],  # out
+    t: wp.array[float],  # out
+    bary: wp.array[wp.vec2],  # out
+):
     i = start + wp.tid()
     o = origins[i]
     d = directions[i]
@@ -65,9 +71,13 @@ def closest_kernel(
 
 @wp.kernel
 def occluded_kernel(
-    start: int, mesh: wp.uint64, origins: wp.array[wp.vec3], directions: wp.array[wp.vec3], t_max: wp.array[float],
+    start: int,
+    mesh: wp.uint64,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    t_max: wp.array[float],
     occluded: wp.array[wp.bool],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     o = origins[i]
     d = directions[i]
@@ -79,19 +89,31 @@ def occluded_kernel(
 
 @wp.kernel
 def offset_origin_kernel(
-    start: int, position: wp.array[wp.vec3], ng: wp.array[wp.vec3], direction: wp.array[wp.vec3], scale: float,
+    start: int,
+    position: wp.array[wp.vec3],
+    ng: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    scale: float,
     origin: wp.array[wp.vec3],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     origin[i] = offset_origin(position[i], ng[i], direction[i], scale)
 
 
 @wp.kernel
 def sight_kernel(
-    start: int, position: wp.array[wp.vec3], normal: wp.array[wp.vec3], c2w: wp.array[wp.mat44],
-    intrinsics: wp.array[wp.vec4], pair: wp.array[wp.int32], size: wp.vec2, grazing: float,
-    origin: wp.array[wp.vec3], direction: wp.array[wp.vec3], t_max: wp.array[float],  # out
-):  # fmt: skip
+    start: int,
+    position: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+    pair: wp.array[wp.int32],
+    size: wp.vec2,
+    grazing: float,
+    origin: wp.array[wp.vec3],  # out
+    direction: wp.array[wp.vec3],  # out
+    t_max: wp.array[float],  # out
+):
     """Ray from a surface point to a camera; ``t_max`` is -1 if the point faces away or projects outside the image.
 
     pair: the ray is of camera ``pair // N`` and point ``pair % N``, so that neighbors go to one camera from about one

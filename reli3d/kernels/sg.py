@@ -127,10 +127,13 @@ def shade_lobe(
 
 @wp.kernel
 def eval_sg_kernel(
-    start: int, axis: wp.array[wp.vec3], sharpness: wp.array[float], amplitude: wp.array[wp.vec3],
+    start: int,
+    axis: wp.array[wp.vec3],
+    sharpness: wp.array[float],
+    amplitude: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     out: wp.array[wp.vec3],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
     for k in range(axis.shape[0]):
@@ -140,10 +143,13 @@ def eval_sg_kernel(
 
 @wp.kernel
 def irradiance_sg_kernel(
-    start: int, axis: wp.array[wp.vec3], sharpness: wp.array[float], amplitude: wp.array[wp.vec3],
+    start: int,
+    axis: wp.array[wp.vec3],
+    sharpness: wp.array[float],
+    amplitude: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
     out: wp.array[wp.vec3],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
     for k in range(axis.shape[0]):
@@ -153,10 +159,17 @@ def irradiance_sg_kernel(
 
 @wp.kernel
 def shade_sg_kernel(
-    start: int, normal: wp.array[wp.vec3], wo: wp.array[wp.vec3], base_color: wp.array[wp.vec3], alpha: wp.array[float],
-    metallic: wp.array[float], axis: wp.array[wp.vec3], sharpness: wp.array[float], amplitude: wp.array[wp.vec3],
+    start: int,
+    normal: wp.array[wp.vec3],
+    wo: wp.array[wp.vec3],
+    base_color: wp.array[wp.vec3],
+    alpha: wp.array[float],
+    metallic: wp.array[float],
+    axis: wp.array[wp.vec3],
+    sharpness: wp.array[float],
+    amplitude: wp.array[wp.vec3],
     out: wp.array[wp.vec3],  # out
-):  # fmt: skip
+):
     i = start + wp.tid()
     a = wp.max(alpha[i], ALPHA_MIN)
     total = wp.vec3(0.0, 0.0, 0.0)

@@ -246,9 +246,15 @@ def sample_value(surface: Surface, plan: Plan, draw: Draw, light: wp.vec3) -> wp
 
 @wp.kernel
 def shade_kernel(
-    start: int, points: Points, light: Light, plan: Plan, mesh: wp.uint64, shadows: int,
-    out: wp.array[wp.vec3], visible: wp.array2d[wp.int32],  # out
-):  # fmt: skip
+    start: int,
+    points: Points,
+    light: Light,
+    plan: Plan,
+    mesh: wp.uint64,
+    shadows: int,
+    out: wp.array[wp.vec3],  # out
+    visible: wp.array2d[wp.int32],  # out
+):
     """Radiance of each hit; traces shadow rays through Warp's BVH."""
     i = start + wp.tid()
     surface = make_surface(plan, points, i)

@@ -43,9 +43,17 @@ def schlick_turn(cos: float) -> float:
 
 @wp.func
 def add_sample_gradient(
-    total: SurfaceGradient, facet: Facet, wo: wp.vec3, wi: wp.vec3, base_color: wp.vec3, alpha: float, metallic: float,
-    conserving: int, value: wp.vec3, weight: wp.vec3,
-) -> SurfaceGradient:  # fmt: skip
+    total: SurfaceGradient,
+    facet: Facet,
+    wo: wp.vec3,
+    wi: wp.vec3,
+    base_color: wp.vec3,
+    alpha: float,
+    metallic: float,
+    conserving: int,
+    value: wp.vec3,
+    weight: wp.vec3,
+) -> SurfaceGradient:
     """``total`` plus the adjoint of ``dot(weight, value cos_i)``; ``value`` is the material's, ``weight`` holds the
     output's adjoint, light and factor."""
     out = total
@@ -97,11 +105,19 @@ def add_sample_gradient(
 
 @wp.kernel
 def shade_adjoint_kernel(
-    start: int, first: int, points: Points, light: Light, plan: Plan, visible: wp.array2d[wp.int32],
+    start: int,
+    first: int,
+    points: Points,
+    light: Light,
+    plan: Plan,
+    visible: wp.array2d[wp.int32],
     g_out: wp.array[wp.vec3],
-    g_normal: wp.array[wp.vec3], g_base_color: wp.array[wp.vec3], g_alpha: wp.array[float],  # out
-    g_metallic: wp.array[float], g_radiance: wp.array2d[wp.vec3],  # out
-):  # fmt: skip
+    g_normal: wp.array[wp.vec3],  # out
+    g_base_color: wp.array[wp.vec3],  # out
+    g_alpha: wp.array[float],  # out
+    g_metallic: wp.array[float],  # out
+    g_radiance: wp.array2d[wp.vec3],  # out
+):
     """Adjoints of the hits from ``first``; ``g_radiance`` is added to.  An output without rows is left out."""
     i = first + start + wp.tid()
     material = g_normal.shape[0] + g_base_color.shape[0] + g_alpha.shape[0] + g_metallic.shape[0]

@@ -67,10 +67,15 @@ def texel(planes: wp.array[vec8], base: int, x: int, y: int, sizes: Sizes) -> ve
 
 @wp.func
 def sample_point(
-    planes: wp.array[vec8], point: wp.vec3,
+    planes: wp.array[vec8],
+    point: wp.vec3,
     slab: int,  # batch * 3 + plane
-    sizes: Sizes, first: int, split: int, features: wp.array[vec8], out: int,
-):  # fmt: skip
+    sizes: Sizes,
+    first: int,
+    split: int,
+    features: wp.array[vec8],
+    out: int,
+):
     """Every ``split``-th block of a point's features in one plane, to ``features`` from ``out`` on."""
     height = sizes.height
     width = sizes.width
@@ -111,9 +116,14 @@ def sample_point(
 
 @wp.kernel
 def sample_kernel(
-    start: int, planes: wp.array[vec8], points: wp.array[wp.vec3], order: wp.array[wp.int32], sizes: Sizes, split: int,
+    start: int,
+    planes: wp.array[vec8],
+    points: wp.array[wp.vec3],
+    order: wp.array[wp.int32],
+    sizes: Sizes,
+    split: int,
     features: wp.array[vec8],  # out
-):  # fmt: skip
+):
     """A thread is a plane, a point and every ``split``-th block; points come by ``order`` if that has entries."""
     i = start + wp.tid()
     first = i % split
@@ -146,11 +156,18 @@ def copy_row(planes: wp.array[float], slab: int, y: int, channels: int, sizes: S
 
 @wp.kernel
 def sample_rows_kernel(
-    start: int, planes: wp.array[float], points: wp.array[wp.vec3], order: wp.array[wp.int32],
-    edges: wp.array[wp.int32], sizes: Sizes, channels: int, bands: int,
-    scratch: wp.array[vec8],  # scratch
+    start: int,
+    planes: wp.array[float],
+    points: wp.array[wp.vec3],
+    order: wp.array[wp.int32],
+    edges: wp.array[wp.int32],
+    sizes: Sizes,
+    channels: int,
+    bands: int,
+    # scratch
+    scratch: wp.array[vec8],
     features: wp.array[vec8],  # out
-):  # fmt: skip
+):
     """As :func:`sample_kernel` from channel-first planes: a thread is a band of rows of cells of a plane.
 
     It keeps the two rows of texels that a row of cells needs, channel-last, in its own ``scratch``, which stays in the
@@ -205,9 +222,13 @@ def sample_rows_kernel(
 
 @wp.kernel
 def points_adjoint_kernel(
-    start: int, planes: wp.array[vec8], points: wp.array[wp.vec3], g_features: wp.array[vec8], sizes: Sizes,
+    start: int,
+    planes: wp.array[vec8],
+    points: wp.array[wp.vec3],
+    g_features: wp.array[vec8],
+    sizes: Sizes,
     g_points: wp.array[wp.vec3],  # out
-):  # fmt: skip
+):
     """Gradient of the features with respect to a point; one-sided, towards +, at a texel center."""
     point = start + wp.tid()
     height = sizes.height
@@ -246,9 +267,12 @@ def points_adjoint_kernel(
 
 @wp.kernel
 def cell_key_kernel(
-    start: int, points: wp.array[wp.vec3], sizes: Sizes, bins: int,
+    start: int,
+    points: wp.array[wp.vec3],
+    sizes: Sizes,
+    bins: int,
     keys: wp.array[wp.int32],  # out
-):  # fmt: skip
+):
     """``row * bins + bin``: the row of cells ``floor(y) + 1`` of a point in a plane, and which part of it.
 
     A row has ``bins`` parts; a point that misses the plane has the row ``height + 1``.
@@ -277,10 +301,18 @@ def add_texel(g_planes: wp.array[vec8], base: int, x: int, y: int, sizes: Sizes,
 
 @wp.kernel
 def planes_adjoint_kernel(
-    start: int, points: wp.array[wp.vec3], g_features: wp.array[vec8], order: wp.array[wp.int32],
-    edges: wp.array[wp.int32], sizes: Sizes, segments: int, row_parity: int, parity: int, split: int,
+    start: int,
+    points: wp.array[wp.vec3],
+    g_features: wp.array[vec8],
+    order: wp.array[wp.int32],
+    edges: wp.array[wp.int32],
+    sizes: Sizes,
+    segments: int,
+    row_parity: int,
+    parity: int,
+    split: int,
     g_planes: wp.array[vec8],  # out
-):  # fmt: skip
+):
     """Gradient of the planes: a thread adds the points of one segment of a row of cells, for every ``split``-th channel
     block, to the two adjacent rows of texels.
 

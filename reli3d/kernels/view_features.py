@@ -35,9 +35,15 @@ class Viewed:
 
 @wp.func
 def view_numbers(
-    image: wp.array3d[wp.vec4], view: int, p: wp.vec3, q: wp.vec3, pose: wp.mat44, surface: int, visible: float,
+    image: wp.array3d[wp.vec4],
+    view: int,
+    p: wp.vec3,
+    q: wp.vec3,
+    pose: wp.mat44,
+    surface: int,
+    visible: float,
     normal: wp.vec3,
-):  # fmt: skip
+):
     """Features of ``p`` in a view where it projects to pixel and depth ``q``, and the unnormalized weight of the view.
 
     The 9 features: color (3), silhouette distance, depth relative to the origin's, 1 inside the image else 0,

@@ -40,9 +40,15 @@ def cell_exit(origin: wp.vec3, direction: wp.vec3, radius: float, size: int, x: 
 
 @wp.func
 def next_sample(
-    occupied: wp.array3d[wp.uint8], origin: wp.vec3, direction: wp.vec3, range_: wp.vec2, radius: float, step: float,
-    shift: float, index: int,
-) -> int:  # fmt: skip
+    occupied: wp.array3d[wp.uint8],
+    origin: wp.vec3,
+    direction: wp.vec3,
+    range_: wp.vec2,
+    radius: float,
+    step: float,
+    shift: float,
+    index: int,
+) -> int:
     """First step from ``index`` on with its sample in an occupied cell, or -1; empty cells are skipped entirely."""
     size = occupied.shape[0]
     k = index
@@ -82,10 +88,20 @@ def step_thickness(density: float, step: float) -> float:
 
 @wp.kernel
 def samples_kernel(
-    start: int, occupied: wp.array3d[wp.uint8], origins: wp.array[wp.vec3], directions: wp.array[wp.vec3],
-    shift: wp.array[float], radius: float, step: float, near: float, far: float, emit: int, first: wp.array[wp.int32],
-    count: wp.array[wp.int32], t: wp.array[float],  # out
-):  # fmt: skip
+    start: int,
+    occupied: wp.array3d[wp.uint8],
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    shift: wp.array[float],
+    radius: float,
+    step: float,
+    near: float,
+    far: float,
+    emit: int,
+    first: wp.array[wp.int32],
+    count: wp.array[wp.int32],  # out
+    t: wp.array[float],  # out
+):
     """Count (``emit`` 0) or list (1, from ``first[i]``) the samples of ray ``i``."""
     i = start + wp.tid()
     if emit == 1 and count[i] == 0:
@@ -107,10 +123,16 @@ def samples_kernel(
 
 @wp.kernel
 def composite_kernel(
-    start: int, density: wp.array[float], color: wp.array[wp.vec3], t: wp.array[float], first: wp.array[wp.int32],
+    start: int,
+    density: wp.array[float],
+    color: wp.array[wp.vec3],
+    t: wp.array[float],
+    first: wp.array[wp.int32],
     step: float,
-    out: wp.array[wp.vec3], opacity: wp.array[float], depth: wp.array[float],  # out
-):  # fmt: skip
+    out: wp.array[wp.vec3],  # out
+    opacity: wp.array[float],  # out
+    depth: wp.array[float],  # out
+):
     """Emission and absorption, Max 1995: a sample counts ``T (1 - exp(-density step))`` of its color and distance."""
     i = start + wp.tid()
     thickness = wp.float32(0.0)
@@ -131,10 +153,18 @@ def composite_kernel(
 
 @wp.kernel
 def composite_adjoint_kernel(
-    start: int, density: wp.array[float], color: wp.array[wp.vec3], t: wp.array[float], first: wp.array[wp.int32],
-    step: float, g_out: wp.array[wp.vec3], g_opacity: wp.array[float], g_depth: wp.array[float],
-    g_density: wp.array[float], g_color: wp.array[wp.vec3],  # out
-):  # fmt: skip
+    start: int,
+    density: wp.array[float],
+    color: wp.array[wp.vec3],
+    t: wp.array[float],
+    first: wp.array[wp.int32],
+    step: float,
+    g_out: wp.array[wp.vec3],
+    g_opacity: wp.array[float],
+    g_depth: wp.array[float],
+    g_density: wp.array[float],  # out
+    g_color: wp.array[wp.vec3],  # out
+):
     """Back to front: with e the adjoint of a sample's weight, d loss / d own thickness = T_after e - sum behind of w e.
 
     The thickness before a sample is the whole one less the samples; that one is below 2 MAX_OPTICAL_DEPTH, so the

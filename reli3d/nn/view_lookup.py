@@ -50,8 +50,10 @@ def pool_views(
     check("tokens", tokens, like=images)
     hidden = tokens.shape[-1]
     if tokens.ndim != 4 or tokens.shape[0] != len(images) or min(tokens.shape[1:3]) < 2 or hidden % BLOCK_CHANNELS:
-        problem = f"tokens: expected ({len(images)}, P, P, H), P at least 2 and H a multiple of {BLOCK_CHANNELS}"
-        raise ValueError(f"{problem}, got {tuple(tokens.shape)}")
+        raise ValueError(
+            f"tokens: expected ({len(images)}, P, P, H), P at least 2 and H a multiple of {BLOCK_CHANNELS}, "
+            f"got {tuple(tokens.shape)}"
+        )
     check("mix", mix, shape=(NUMBERS, hidden), like=images)
     pooled = points.new_empty(n, hidden)
     layer = [t.detach().contiguous().unflatten(-1, (-1, BLOCK_CHANNELS)) for t in (tokens, mix)]

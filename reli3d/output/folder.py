@@ -33,8 +33,11 @@ def check_folder(folder: Path) -> Path:
     folder = Path(os.path.realpath(folder))
     for part in folder.parts:
         if (size := len(os.fsencode(part))) > LONGEST:
-            problem = f"expected a name of at most {LONGEST} bytes for the output, got {size}"
-            raise InputError(shown(part), f"{problem}; rename the folder or give another --output")
+            raise InputError(
+                shown(part),
+                f"expected a name of at most {LONGEST} bytes for the output, got {size}; rename the folder or give "
+                "another --output",
+            )
     above = folder
     while not os.path.lexists(above):
         above = above.parent
@@ -158,8 +161,10 @@ def _locked(work: Path, folder: Path) -> int:
                 return lock
         except BlockingIOError:
             os.close(lock)
-            problem = f"{folder}: expected no other process at this result, got one at work"
-            raise OSError(f"{problem}; wait for it or give another --output") from None
+            raise OSError(
+                f"{folder}: expected no other process at this result, got one at work; wait for it or give "
+                "another --output"
+            ) from None
         except FileNotFoundError:
             pass
         except OSError as error:

@@ -11,12 +11,20 @@ from reli3d.io.files import file_size
 
 # Axes and dtype of each tensor of :mod:`reli3d.synthetic.samples`; equal letters must have equal sizes.
 TENSORS = {
-    "images": ("V S S 4", "U8"), "c2w": ("V 4 4", "F32"), "intrinsics": ("V 4", "F32"),
-    "environment": ("32 64 3", "F16"), "points": ("P 3", "F16"), "distance": ("P", "F16"),
-    "surface": ("N 3 3", "F16"), "material": ("N 5", "U8"), "visible": ("N V", "U8"),
-    "view_material": ("V S S 5", "U8"), "view_normal": ("V S S 3", "I8"), "view_depth": ("V S S", "F16"),
+    "images": ("V S S 4", "U8"),
+    "c2w": ("V 4 4", "F32"),
+    "intrinsics": ("V 4", "F32"),
+    "environment": ("32 64 3", "F16"),
+    "points": ("P 3", "F16"),
+    "distance": ("P", "F16"),
+    "surface": ("N 3 3", "F16"),
+    "material": ("N 5", "U8"),
+    "visible": ("N V", "U8"),
+    "view_material": ("V S S 5", "U8"),
+    "view_normal": ("V S S 3", "I8"),
+    "view_depth": ("V S S", "F16"),
     "finish_known": ("V", "U8"),
-}  # fmt: skip
+}
 POINT_TENSORS = ("points", "distance", "surface", "material", "visible")  # absent from samples with views only
 OPTIONAL = ("finish_known",)  # not in samples of version 0.3, whose finish is taken as known
 
@@ -32,8 +40,9 @@ def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True
             slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 - no iterable
             found = {name: (tuple(s.get_shape()), s.get_dtype()) for name, s in slices.items()}
     except SafetensorError as error:
-        problem = f"expected a sample of reli3d-data, got a broken file ({shown(str(error))})"
-        raise InputError(path, f"{problem}; make it again") from None
+        raise InputError(
+            path, f"expected a sample of reli3d-data, got a broken file ({shown(str(error))}); make it again"
+        ) from None
     sizes: dict[str, int] = {}
     for name, (axes, dtype) in TENSORS.items():
         if (name in POINT_TENSORS and not points) or (name in OPTIONAL and name not in found):
@@ -45,8 +54,10 @@ def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True
             raise InputError(path, f"{name}: expected {dtype} ({', '.join(expected)}), got {found_text}; make it again")
         for letter, size in zip(expected, shape, strict=True):
             if size < 1 or size != (int(letter) if letter.isdigit() else sizes.setdefault(letter, size)):
-                problem = f"{name}: expected ({', '.join(expected)}) as in its other tensors, got {shape}"
-                raise InputError(path, f"{problem}; make it again")
+                raise InputError(
+                    path,
+                    f"{name}: expected ({', '.join(expected)}) as in its other tensors, got {shape}; make it again",
+                )
     if sizes["V"] < views:
         raise InputError(path, f"views: expected at least {views}, got {sizes['V']}; make samples of more views")
 

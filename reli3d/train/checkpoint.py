@@ -82,8 +82,9 @@ def load(path: Path) -> dict[str, Any]:
     if "param_groups" not in state["optimizer"]:
         raise InputError(path, "optimizer: expected param_groups, got none; remove the file to start again")
     if not isinstance(state.get("step"), int) or state["step"] < 0:
-        problem = f"step: expected a count, got {shown(state.get('step'))}"
-        raise InputError(path, f"{problem}; remove the file to start again")
+        raise InputError(
+            path, f"step: expected a count, got {shown(state.get('step'))}; remove the file to start again"
+        )
     return {"stage": "", "seconds": 0.0, "measures": {}, **state}
 
 

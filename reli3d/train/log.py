@@ -80,8 +80,9 @@ def summary_writer() -> type:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        problem = "expected the package tensorboard, got none"
-        raise InputError("--tensorboard", f"{problem}; pip install tensorboard") from None
+        raise InputError(
+            "--tensorboard", "expected the package tensorboard, got none; pip install tensorboard"
+        ) from None
     return SummaryWriter
 
 

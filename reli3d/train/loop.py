@@ -132,8 +132,10 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
         if not bad:
             optimizer.step()
         elif bad >= options.bad_steps:
-            problem = f"gradients: expected finite ones, got none in {bad} steps"
-            raise RuntimeError(f"{problem}; the last checkpoint is {folder / 'state.pt'}")
+            raise RuntimeError(
+                f"gradients: expected finite ones, got none in {bad} steps; the last checkpoint is "
+                f"{folder / 'state.pt'}"
+            )
         checkpoint.update_average(average, model, min(options.average, (1 + step) / (10 + step)))
         step, seconds, sums = step + 1, float(values[-1]), sums + values[:-1]
         bar.set_description(f"{stage.name}, step {step}", refresh=False)

@@ -35,8 +35,11 @@ def read_llff(folder: Path, path: Path) -> tuple[list[Frame], list[str]]:
         where, pose = f"{path}: row {k}", row[:15].reshape(3, 5)
         height, width, focal = pose[:, 4]
         if not (height >= 1 and width >= 1 and focal > 0):
-            problem = f"hwf: expected a positive size and focal length, got {shown(pose[:, 4].tolist())}"
-            raise InputError(where, f"{problem}; run LLFF's imgs2poses again")
+            raise InputError(
+                where,
+                f"hwf: expected a positive size and focal length, got {shown(pose[:, 4].tolist())}; "
+                "run LLFF's imgs2poses again",
+            )
         c2w = np.eye(4)
         c2w[:3] = np.stack([pose[:, 1], -pose[:, 0], pose[:, 2], pose[:, 3]], -1)
         lens = Lens(focal=(focal, focal), size=(round(width), round(height)))
@@ -58,8 +61,9 @@ def read_neus(folder: Path, path: Path) -> tuple[list[Frame], list[str]]:
     images = _as_many(path, folder / place, sum(key.startswith("world_mat_") and "inv" not in key for key in arrays))
     masks = [at for at in (images_in(folder / at) for at in named(folder, ("mask", "masks"))) if at]
     if masks and len(masks[0]) != len(images):
-        problem = f"expected {len(images)} masks, one for each image, got {len(masks[0])}"
-        raise InputError(masks[0][0].parent, f"{problem}; add or remove")
+        raise InputError(
+            masks[0][0].parent, f"expected {len(images)} masks, one for each image, got {len(masks[0])}; add or remove"
+        )
     frames = []
     for k, image in enumerate(images):
         where = f"{path}: world_mat_{k}, scale_mat_{k}"
@@ -127,6 +131,9 @@ def _shape(array: np.ndarray | dict) -> str:
 def _as_many(path: Path, folder: Path, count: int) -> list[Path]:
     images = images_in(folder)
     if len(images) != count or not images:
-        problem = f"expected {count} images in {folder.name}, one for each camera in the order of their names"
-        raise InputError(path, f"{problem}, got {len(images)}; add or remove images")
+        raise InputError(
+            path,
+            f"expected {count} images in {folder.name}, one for each camera in the order of their names, got "
+            f"{len(images)}; add or remove images",
+        )
     return images

@@ -72,15 +72,17 @@ def read_colmap(folder: Path, models: Sequence[Path]) -> tuple[list[Frame], list
     index, names = FolderIndex(), [PurePath(name) for name, *_ in entries[best]]
     name, count = Counter(name for name, *_ in entries[best]).most_common(1)[0]
     if count > 1:
-        problem = f"NAME: expected each image once, got {shown(name)} {count} times"
-        raise InputError(path, f"{problem}; export the model again")
+        raise InputError(
+            path, f"NAME: expected each image once, got {shown(name)} {count} times; export the model again"
+        )
     places = [at for at in (folder / "images", folder) if at.is_dir()]
     images = max(places, key=lambda at: sum(index.find(at, name) is not None for name in names))
     frames, missing = [], []
     for name, where, pose, camera in sorted(entries[best], key=lambda entry: entry[0]):
         if camera not in lenses:
-            problem = f"CAMERA_ID: expected one of the model's cameras, got {shown(camera)}"
-            raise InputError(where, f"{problem}; export it again")
+            raise InputError(
+                where, f"CAMERA_ID: expected one of the model's cameras, got {shown(camera)}; export it again"
+            )
         image = file_within(images, where, "NAME", name)
         found = image if os.path.isfile(image) else index.find(images, PurePath(name))
         c2w = _pose(where, pose)
@@ -89,8 +91,9 @@ def read_colmap(folder: Path, models: Sequence[Path]) -> tuple[list[Frame], list
         else:
             frames.append(Frame(where, name, found, None, c2w, lenses[camera]))
     if not frames:
-        problem = f"NAME: expected images in {images}, got {shown(missing[0])} which does not exist"
-        raise InputError(path, f"{problem}; copy them in")
+        raise InputError(
+            path, f"NAME: expected images in {images}, got {shown(missing[0])} which does not exist; copy them in"
+        )
     return frames, notes + _counted(folder, images, frames, missing)
 
 
@@ -129,8 +132,11 @@ def _text_images(path: Path) -> Iterator[tuple[str, str, list[float], str]]:
         words = line.split(maxsplit=9)
         where = f"{path}: line {n}"
         if len(words) != 10:
-            problem = f"expected ID, rotation (4), translation (3), camera and name, got {shown(line)}"
-            raise InputError(where, f"{problem}; export the model again")
+            raise InputError(
+                where,
+                "expected ID, rotation (4), translation (3), camera and name, got "
+                f"{shown(line)}; export the model again",
+            )
         yield words[9], where, [_real(where, "QVEC TVEC", v) for v in words[1:8]], words[8]
 
 
@@ -158,8 +164,9 @@ def _text_cameras(path: Path) -> Iterator[tuple[str, str, str, list[float], list
     for n, line in _lines(path):
         where, words = f"{path}: line {n}", line.split()
         if len(words) < 5:
-            problem = f"expected ID, model, width, height, parameters, got {shown(line)}"
-            raise InputError(where, f"{problem}; export it again")
+            raise InputError(
+                where, f"expected ID, model, width, height, parameters, got {shown(line)}; export it again"
+            )
         if words[1] not in _MODELS:
             raise colmap_binary.no_pinhole(where, words[1], _MODELS)
         size = [_real(where, field, v) for field, v in zip(("WIDTH", "HEIGHT"), words[2:4])]
@@ -173,12 +180,17 @@ def _lenses(cameras: Iterator) -> dict[object, Lens]:
             raise InputError(where, f"CAMERA_ID: expected every camera once, got {shown(key)} twice; export it again")
         focals, radial, tangential = _MODELS[model]
         if len(values) != focals + 2 + radial + tangential:
-            problem = f"PARAMS: expected {focals + 2 + radial + tangential} numbers for {model}, got {len(values)}"
-            raise InputError(where, f"{problem}; export it again")
+            raise InputError(
+                where,
+                f"PARAMS: expected {focals + 2 + radial + tangential} numbers for {model}, got "
+                f"{len(values)}; export it again",
+            )
         values = [number(where, "PARAMS", v, -1e9, 1e9) for v in values]
         if min(values[:focals]) <= 0 or min(size) < 1 or max(size) > 1e6:
-            problem = f"PARAMS: expected a positive size and focal length, got {shown([*size, *values])}"
-            raise InputError(where, f"{problem}; export it again")
+            raise InputError(
+                where,
+                f"PARAMS: expected a positive size and focal length, got {shown([*size, *values])}; export it again",
+            )
         lenses[key] = Lens(
             focal=(values[0], values[focals - 1]),
             center=(values[focals], values[focals + 1]),

@@ -88,8 +88,10 @@ class _Entries:
         start = self.file.tell()
         data, end, _ = self.file.read(4 * MAX_PATH + 1).partition(b"\0")
         if not end:
-            problem = f"NAME: expected a name of at most {4 * MAX_PATH} bytes, got no end of it"
-            raise InputError(where, f"{problem}; export the model again")
+            raise InputError(
+                where,
+                f"NAME: expected a name of at most {4 * MAX_PATH} bytes, got no end of it; export the model again",
+            )
         self.file.seek(start + len(data) + 1)
         try:
             return data.decode("utf-8")
@@ -97,5 +99,7 @@ class _Entries:
             raise InputError(where, "NAME: expected UTF-8, got other bytes; export the model again") from None
 
     def _short(self):
-        problem = f"expected more than the {self.size} bytes of the file"
-        raise InputError(self.where, f"{problem}; it is cut off or no COLMAP model, export it again")
+        raise InputError(
+            self.where,
+            f"expected more than the {self.size} bytes of the file; it is cut off or no COLMAP model, export it again",
+        )

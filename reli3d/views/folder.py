@@ -213,22 +213,30 @@ def _load(
     notes: list[str] = []
     path = frame.image
     if not os.path.exists(path):
-        problem = f"file_path: expected an image, got {shown(frame.name)} which does not exist"
-        raise InputError(frame.where, f"{problem}; paths are relative to the camera file and use /")
+        raise InputError(
+            frame.where,
+            f"file_path: expected an image, got {shown(frame.name)} which does not exist; "
+            "paths are relative to the camera file and use /",
+        )
     _still_inside(root, path, frame)
     bitmap = decode_image(path, notes=notes, calibrated=frame.lens.size)
     width, height = bitmap.size
     if min(height, width) < MIN_SIDE:
-        problem = f"expected at least {MIN_SIDE} pixels a side, got {width} x {height}"
-        raise InputError(path, f"{problem}; give a larger image")
+        raise InputError(
+            path, f"expected at least {MIN_SIDE} pixels a side, got {width} x {height}; give a larger image"
+        )
     mask = _mask(root, frame, bitmap, files, notes, remover)
     if mask.size != (width, height):
         got = f"{mask.size[0]} x {mask.size[1]}"
-        problem = f"mask: expected {width} x {height} pixels as the image, got {got}"
-        raise InputError(path, f"{problem}; save it at that size")
+        raise InputError(
+            path, f"mask: expected {width} x {height} pixels as the image, got {got}; save it at that size"
+        )
     if int(above(mask, 0.5).sum()) < MIN_OBJECT:
-        problem = "mask: expected the object to be opaque (white), got a mask that is empty"
-        raise InputError(path, f"{problem}; check that it is neither blank nor inverted")
+        raise InputError(
+            path,
+            "mask: expected the object to be opaque (white), got a mask that is empty; "
+            "check that it is neither blank nor inverted",
+        )
     camera = intrinsics_of(frame.lens, width, height, frame.where, notes)
     part = cut(bitmap.size, above(mask, MASK_EDGE), whole=whole)
     if part is not None:
@@ -267,14 +275,17 @@ def _mask(
     found = files.of(frame)
     if found is not None:
         if not os.path.exists(found):
-            problem = f"mask_path: expected an image, got {shown(found.name)} which does not exist"
-            raise InputError(frame.where, f"{problem}; correct the path")
+            raise InputError(
+                frame.where,
+                f"mask_path: expected an image, got {shown(found.name)} which does not exist; correct the path",
+            )
         if files.given is None:
             _still_inside(root, found, frame)
         return mask_values(found, decode_image(found, notes=notes, calibrated=frame.lens.size), notes)
     if files.given is not None:
-        problem = f"masks: expected a file with the stem of {shown(frame.image.name)}, got none"
-        raise InputError(files.given, f"{problem}; add it")
+        raise InputError(
+            files.given, f"masks: expected a file with the stem of {shown(frame.image.name)}, got none; add it"
+        )
     if remover is not None:
         return remover.mask(bitmap)
     got = "alpha that is opaque everywhere" if bitmap.mode == "RGBA" else "no alpha"
@@ -303,8 +314,11 @@ def _existing(root: Path, path: Path, index: FolderIndex) -> Path | None:
 
 def _still_inside(root: Path, path: Path, frame: Frame) -> None:
     if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
-        problem = f"file_path: expected a file within the folder, got {shown(path.name)} which links out of it"
-        raise InputError(frame.where, f"{problem}; copy the file in")
+        raise InputError(
+            frame.where,
+            f"file_path: expected a file within the folder, got {shown(path.name)} which "
+            "links out of it; copy the file in",
+        )
 
 
 def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[str]) -> list[float]:
@@ -316,8 +330,11 @@ def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[s
     if lens.size is not None and lens.size != (width, height):
         sx, sy = width / lens.size[0], height / lens.size[1]
         if abs(sx / sy - 1.0) > ASPECT:
-            problem = f"w, h: expected the image's size {width} x {height}, got {lens.size[0]} x {lens.size[1]}"
-            raise InputError(where, f"{problem}; calibrate on these images")
+            raise InputError(
+                where,
+                f"w, h: expected the image's size {width} x {height}, got {lens.size[0]} x "
+                f"{lens.size[1]}; calibrate on these images",
+            )
         notes.append(f"{where}: intrinsics scaled from {lens.size[0]} x {lens.size[1]} to {width} x {height}")
     if lens.focal is not None:
         fx, fy = lens.focal[0] * sx, lens.focal[1] * sy
@@ -331,13 +348,23 @@ def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[s
     cx = 0.5 * width if math.isnan(given[0]) else given[0] * sx
     cy = 0.5 * height if math.isnan(given[1]) else given[1] * sy
     if max(map(abs, given)) <= 1:
-        problem = f"cx, cy: expected pixels, got {given[0]:.6g} and {given[1]:.6g}, fractions of the image"
-        raise InputError(where, f"{problem}; multiply them by its width and height")
+        raise InputError(
+            where,
+            f"cx, cy: expected pixels, got {given[0]:.6g} and {given[1]:.6g}, fractions of the image; multiply them by "
+            "its width and height",
+        )
     for name, value, side in (("cx", cx, width), ("cy", cy, height)):
         if not -side < value < 2 * side:
-            problem = f"{name}: expected a principal point near the image of {side} pixels, got {value:.6g}"
-            raise InputError(where, f"{problem}; give pixels of the stored image")
+            raise InputError(
+                where,
+                f"{name}: expected a principal point near the image of {side} pixels, got "
+                f"{value:.6g}; "
+                "give pixels of the stored image",
+            )
     if min(fx / width, fy / height) < 0.05 or max(fx / width, fy / height) > 1000:
-        problem = f"focal length: expected 0.05 to 1000 image sides, got {fx:.6g} pixels for {width}"
-        raise InputError(where, f"{problem}; give pixels (or radians for an angle)")
+        raise InputError(
+            where,
+            f"focal length: expected 0.05 to 1000 image sides, got {fx:.6g} pixels for {width}; "
+            "give pixels (or radians for an angle)",
+        )
     return [fx, fy, cx, cy]

@@ -62,8 +62,11 @@ def number(where: str, field: str, value: object, low: float = -math.inf, high: 
 def rigid(where: str, field: str, value: object) -> np.ndarray:
     """``(4, 4)`` float64 rotation and translation from nested lists.  Raises InputError; rounding is cleaned up."""
     if not isinstance(value, list) or len(value) != 4 or any(not isinstance(r, list) or len(r) != 4 for r in value):
-        problem = f"{field}: expected a 4x4 matrix as four lists of four numbers, got {shape_of(value)}"
-        raise InputError(where, f"{problem}; write the camera-to-world matrix row by row")
+        raise InputError(
+            where,
+            f"{field}: expected a 4x4 matrix as four lists of four numbers, got {shape_of(value)}; "
+            "write the camera-to-world matrix row by row",
+        )
     matrix = np.array([[number(where, field, v) for v in row] for row in value], dtype=np.float64)
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         transposed = np.abs(matrix[:, 3] - (0, 0, 0, 1)).max() <= 1e-6
@@ -78,19 +81,29 @@ def nearest_rigid(where: str, field: str, matrix: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
         determinant, gram = float(np.linalg.det(block)), block.T @ block
     if not np.isfinite(gram).all() or not determinant > 0:
-        problem = f"{field}: expected a rotation (determinant 1), got determinant {determinant:.3g}"
-        raise InputError(where, f"{problem}; a mirrored or flat camera cannot be used, export it again")
+        raise InputError(
+            where,
+            f"{field}: expected a rotation (determinant 1), got determinant {determinant:.3g}; "
+            "a mirrored or flat camera cannot be used, export it again",
+        )
     if np.abs(gram - np.eye(3)).max() > ORTHONORMAL:
         scale = determinant ** (1 / 3)
         skew = np.abs(gram / scale**2 - np.eye(3)).max()
         if skew <= ORTHONORMAL and abs(scale**2 - 1) > skew:
-            problem = f"{field}: expected a rotation without scale, got scale {scale:.4g}"
-            raise InputError(where, f"{problem}; divide the 3x3 block by it")
-        problem = f"{field}: expected a rotation, got axes that are not at right angles or not of length 1"
-        raise InputError(where, f"{problem}; export rotation and translation only")
+            raise InputError(
+                where, f"{field}: expected a rotation without scale, got scale {scale:.4g}; divide the 3x3 block by it"
+            )
+        raise InputError(
+            where,
+            f"{field}: expected a rotation, got axes that are not at right angles or not of length "
+            "1; export rotation and translation only",
+        )
     if np.abs(matrix[:3, 3]).max() > MAX_POSE_DISTANCE:
-        problem = f"{field}: expected a position within {MAX_POSE_DISTANCE:g} of the origin"
-        raise InputError(where, f"{problem}, got {shown(matrix[:3, 3].tolist())}; shift or scale the cameras")
+        raise InputError(
+            where,
+            f"{field}: expected a position within {MAX_POSE_DISTANCE:g} of the origin, got "
+            f"{shown(matrix[:3, 3].tolist())}; shift or scale the cameras",
+        )
     u, _, vt = np.linalg.svd(block)
     result = matrix.copy()
     result[:3, :3] = u @ vt
@@ -113,22 +126,31 @@ def file_within(root: Path, where: str, field: str, value: object) -> Path:
     if not isinstance(value, str) or not value.strip():
         raise InputError(where, f"{field}: expected the path of a file, got {shown(value)}; correct the camera file")
     if len(value) > MAX_PATH or "\0" in value:
-        problem = f"{field}: expected a path of at most {MAX_PATH} characters without NUL, got {shown(value)}"
-        raise InputError(where, f"{problem}; correct the camera file")
+        raise InputError(
+            where,
+            f"{field}: expected a path of at most {MAX_PATH} characters without NUL, got "
+            f"{shown(value)}; correct the camera file",
+        )
     if "://" in value or value.lower().startswith(("file:", "data:")):
-        problem = f"{field}: expected a file of the folder, got the URL {shown(value)}"
-        raise InputError(where, f"{problem}; download it first")
+        raise InputError(
+            where, f"{field}: expected a file of the folder, got the URL {shown(value)}; download it first"
+        )
     if Path(value).is_absolute() or PureWindowsPath(value).drive or value.startswith(("\\", "~")):
-        problem = f"{field}: expected a path within the folder, got the absolute {shown(value)}"
-        raise InputError(where, f"{problem}; copy the file in and write a relative path")
+        raise InputError(
+            where,
+            f"{field}: expected a path within the folder, got the absolute {shown(value)}; "
+            "copy the file in and write a relative path",
+        )
     path = root / value
     try:
         real, base = Path(os.path.realpath(path)), Path(os.path.realpath(root))
     except (OSError, ValueError):
         raise InputError(where, f"{field}: expected the path of a file, got {shown(value)}; correct it") from None
     if not real.is_relative_to(base):
-        problem = f"{field}: expected a file within the folder, got {shown(value)} which leads out of it"
-        raise InputError(where, f"{problem}; copy the file in")
+        raise InputError(
+            where,
+            f"{field}: expected a file within the folder, got {shown(value)} which leads out of it; copy the file in",
+        )
     return path
 
 
@@ -141,8 +163,11 @@ def check_distortion(where: str, lens: Lens, focal: float, width: int, height: i
     except OverflowError:  # a focal length next to nothing
         moved = math.inf
     if not moved <= MAX_DISTORTION_PIXELS:
-        problem = f"distortion: expected an undistorted lens, got a displacement of {moved:.3g} pixels"
-        raise InputError(where, f"{problem}; undistort the images (colmap image_undistorter)")
+        raise InputError(
+            where,
+            f"distortion: expected an undistorted lens, got a displacement of {moved:.3g} pixels; undistort the images "
+            "(colmap image_undistorter)",
+        )
     return f"{where}: lens distortion of at most {moved:.2g} pixels ignored"
 
 

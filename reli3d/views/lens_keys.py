@@ -71,21 +71,26 @@ def check_keys(where: str, values: dict) -> None:
     for key, value in values.items():
         word = _word(key)
         if isinstance(value, str) and _AXES.fullmatch(word) and _OPENCV.fullmatch(value.lower().strip()):
-            problem = f"{key}: expected camera-to-world matrices in OpenGL axes, got {shown(value)}"
-            raise InputError(where, f"{problem}; negate the second and third column of each matrix and remove the key")
+            raise InputError(
+                where,
+                f"{key}: expected camera-to-world matrices in OpenGL axes, got {shown(value)}; negate the second and "
+                "third column of each matrix and remove the key",
+            )
         if key in _READ or _nothing(value):
             continue
         if _MODEL.fullmatch(word) and isinstance(value, str):
             if re.sub(r"[^A-Z0-9]+", "_", value.upper().strip()) not in _PINHOLE:
-                problem = f"{key}: expected a pinhole camera, got {shown(value)}"
-                raise InputError(where, f"{problem}; undistort the images first")
+                raise InputError(
+                    where, f"{key}: expected a pinhole camera, got {shown(value)}; undistort the images first"
+                )
         elif _no_pinhole(key, value):
             raise InputError(where, f"{key}: expected a pinhole camera, got {shown(value)}; undistort the images first")
         elif (_BENT.fullmatch(word) and not (word.startswith("s") and isinstance(value, str))) or (
             word in _COEFFICIENTS and isinstance(value, list)
         ):
-            problem = f"{key}: expected 0 or none, as it is not read, got {shown(value)}"
-            raise InputError(where, f"{problem}; undistort the images first")
+            raise InputError(
+                where, f"{key}: expected 0 or none, as it is not read, got {shown(value)}; undistort the images first"
+            )
         elif _LENS.fullmatch(word) and not _words(value):
             expected = "fl_x in pixels, camera_angle_x in radians or a 3x3 matrix intrinsics"
             problem = f"{key}: expected {expected}, got a key of the lens that is not read, {shown(value)}"
@@ -159,8 +164,11 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
             name, lens, ratio = spellings[0]
             for other, _, value in spellings[1:]:
                 if abs(ratio - value) > AGREE * ratio:  # False where one is not known, NaN
-                    problem = f"{other}: expected the focal length of {name}, {ratio:.4g} image widths, got {value:.4g}"
-                    raise InputError(where, f"{problem}; remove the wrong one")
+                    raise InputError(
+                        where,
+                        f"{other}: expected the focal length of {name}, {ratio:.4g} image widths, got {value:.4g}; "
+                        "remove the wrong one",
+                    )
             if lens.center is None:
                 lens = replace(lens, center=center)
             if name not in _FOVS or lens.center is not None:
@@ -257,8 +265,11 @@ def _matrix(where: str, key: str, value: object) -> tuple[float, float, float, f
     m = np.array([[number(where, key, v, -1e9, 1e9) for v in row[:3]] for row in rows[:3]])
     fx, fy, cx, cy = m[0, 0], m[1, 1], m[0, 2], m[1, 2]
     if not (min(fx, fy) > 0 and np.abs(m[2] - (0, 0, 1)).max() < 1e-6 and abs(m[1, 0]) + abs(m[0, 1]) <= MAX_SKEW * fx):
-        problem = f"{key}: expected the rows fx 0 cx, 0 fy cy, 0 0 1 in pixels with fx and fy above 0"
-        raise InputError(where, f"{problem}, got {shown(m.tolist(), 120)}; correct the camera file")
+        raise InputError(
+            where,
+            f"{key}: expected the rows fx 0 cx, 0 fy cy, 0 0 1 in pixels with fx and fy above 0, got "
+            f"{shown(m.tolist(), 120)}; correct the camera file",
+        )
     return float(fx), float(fy), float(cx), float(cy)
 
 

@@ -81,8 +81,9 @@ def check_one_label(folder: os.PathLike, notes: Sequence[str]) -> None:
     """Raises InputError where the notes of several masks name different values or colors of the object."""
     labels = sorted({note.removeprefix(LABEL).partition(" instead")[0] for note in notes if note.startswith(LABEL)})
     if len(labels) > 1:
-        problem = f"masks: expected one label in all masks, got {', '.join(labels[:4])}"
-        raise InputError(folder, f"{problem}; save masks of one object")
+        raise InputError(
+            folder, f"masks: expected one label in all masks, got {', '.join(labels[:4])}; save masks of one object"
+        )
 
 
 def _coverage(path: os.PathLike, channel: Image.Image, notes: list[str]) -> Image.Image:
@@ -214,6 +215,9 @@ class MaskFiles:
         images = self._images.get(os.path.realpath(mask), [])
         if len({os.path.realpath(p) for p in images}) > 1:
             first, second = (self._relative(p).as_posix() for p in images[:2])
-            problem = f"expected the mask of one image, got that of {shown(first)} and {shown(second)}"
-            raise InputError(mask, f"{problem}; put masks into sub-folders as the images are")
+            raise InputError(
+                mask,
+                f"expected the mask of one image, got that of {shown(first)} and {shown(second)}; put masks into "
+                "sub-folders as the images are",
+            )
         return mask

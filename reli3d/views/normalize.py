@@ -172,8 +172,10 @@ def near_origin(c2w: Tensor) -> Tensor:
     aim = meeting_point(eyes, -c2w[:, :3, 2])[0]
     reach = float((eyes - aim).norm(dim=-1).median())
     if reach < MIN_OBJECT_DISTANCE and float((eyes - aim).abs().max()) > POSITION_PRECISION * float(eyes.abs().max()):
-        problem = f"expected a distance of {MIN_OBJECT_DISTANCE:g} or more to the object, got {reach:.3g}"
-        raise InputError("cameras", f"{problem}; scale poses up")
+        raise InputError(
+            "cameras",
+            f"expected a distance of {MIN_OBJECT_DISTANCE:g} or more to the object, got {reach:.3g}; scale poses up",
+        )
     far = float(aim.norm()) > FAR_DISTANCES * reach and reach >= MIN_OBJECT_DISTANCE
     return aim if far else torch.zeros_like(aim)
 

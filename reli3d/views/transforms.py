@@ -34,8 +34,9 @@ def read_json(path: Path) -> dict:
     except ValueError:
         raise InputError(path, "expected numbers, got an integer of thousands of digits; correct the file") from None
     if not isinstance(value, dict):
-        problem = f"expected a JSON object with frames, got {type(value).__name__}"
-        raise InputError(path, f"{problem}; export the cameras again")
+        raise InputError(
+            path, f"expected a JSON object with frames, got {type(value).__name__}; export the cameras again"
+        )
     return value
 
 
@@ -89,8 +90,9 @@ def _frame(path: Path, index: int, frame: dict, data: dict) -> Frame:
     where = f"{path}: frames[{index}]"
     key = next((k for k in ("transform_matrix", "camera_transform") if frame.get(k) is not None), None)
     if key is None:
-        problem = "transform_matrix: expected the camera-to-world matrix, got none"
-        raise InputError(where, f"{problem}; export the cameras again")
+        raise InputError(
+            where, "transform_matrix: expected the camera-to-world matrix, got none; export the cameras again"
+        )
     image = file_within(path.parent, where, "file_path", frame.get("file_path"))
     mask = frame.get("mask_path")
     mask = None if mask is None else file_within(path.parent, where, "mask_path", mask)

@@ -318,21 +318,23 @@ def smoothing(g) -> Op:
     return Op({"vertices": mesh.vertices}, ours, in_float64)
 
 
-PLAIN = (
-    triplane,
-    flexicubes,
-    centers,
-    deviation,
-    texture,
-    normals,
-    flat_normals,
-    smoothing,
-    density,
-    irradiance,
-    gaussians,
-)
 OPS = {
-    **{f.__name__: f for f in PLAIN},
+    **{
+        f.__name__: f
+        for f in (
+            triplane,
+            flexicubes,
+            centers,
+            deviation,
+            texture,
+            normals,
+            flat_normals,
+            smoothing,
+            density,
+            irradiance,
+            gaussians,
+        )
+    },
     **{f"attributes {n}": partial(attributes, channels=n) for n in (2, 3, 4)},
     **{f"points {name}": partial(points_of_a_mesh, tangents=name == "tangents") for name in ("tangents", "uv")},
     **{f"reflections {lobe}": partial(reflections, lobe=lobe) for lobe in ("visible", "mirrored")},

@@ -75,8 +75,13 @@ def test_normal_map_points_right_and_up_as_in_gltf(device, explicit):
     """Red bends the normal towards u (right), green towards the top of the texture."""
     mesh = square(device)
     if explicit:
-        tangents = torch.tensor([[1.0, 0, 0, 1]], device=device).expand(4, 4).contiguous()
-        mesh = Mesh(mesh.vertices, mesh.faces, mesh.normals, mesh.uv, tangents)
+        mesh = Mesh(
+            mesh.vertices,
+            mesh.faces,
+            mesh.normals,
+            mesh.uv,
+            torch.tensor([[1.0, 0, 0, 1]], device=device).expand(4, 4).contiguous(),
+        )
     face, bary = torch.tensor([0, 1], dtype=torch.int32, device=device), torch.full((2, 2), 0.3, device=device)
     s = math.sqrt(0.5)
     for color, expected in (

@@ -201,8 +201,18 @@ def test_random_pairs_are_uniform_independent_and_addressed():
 
 def test_streams_have_distinct_states():
     """A million pairs of 48 bits from ten streams of neighboring counters; by chance 0.002 would be equal."""
-    streams = [{}, {"dimension": 1}, {"dimension": 2}, {"seed": 1, "sample": 1, "dimension": 1}]
-    streams += [{name: k} for name in ("seed", "sample") for k in (1, 2, 1 << 16)]
+    streams = [
+        {},
+        {"seed": 1},
+        {"seed": 2},
+        {"seed": 1 << 16},
+        {"sample": 1},
+        {"sample": 2},
+        {"sample": 1 << 16},
+        {"dimension": 1},
+        {"dimension": 2},
+        {"seed": 1, "sample": 1, "dimension": 1},
+    ]
     u = torch.cat([reference.random_pairs(100_000, **stream) for stream in streams])
     bits = (u.double() * 2**24).long()
     assert len(torch.unique(bits[:, 0] * 2**24 + bits[:, 1])) == len(u)

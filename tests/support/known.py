@@ -140,11 +140,23 @@ def names(rng: Random) -> Case:
 
 
 UNKNOWN = (
-    {"is_fisheye": True}, {"fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}, {"camera_type": "FISHEYE"},
-    {"lens_type": "fisheye"}, {"ftheta_p0": 0.1, "ftheta_p1": 0.9}, {"projection": "equirectangular"},
-    {"camera_model": "EQUIRECTANGULAR"}, {"focal_px": 55.0}, {"hfov": 40.0}, {"fov_x": 40.0}, {"horizontal_fov": 0.7},
-    {"fov": 40.0}, {"focal": 55.0}, {"lens": 35.0}, {"camera_intrinsics_px": [55.0, 55.0, 32.0, 24.0]},
-)  # fmt: skip
+    {"is_fisheye": True},
+    {"fisheye": True},
+    {"camera_model": "OPENCV_FISHEYE"},
+    {"camera_type": "FISHEYE"},
+    {"lens_type": "fisheye"},
+    {"ftheta_p0": 0.1, "ftheta_p1": 0.9},
+    {"projection": "equirectangular"},
+    {"camera_model": "EQUIRECTANGULAR"},
+    {"focal_px": 55.0},
+    {"hfov": 40.0},
+    {"fov_x": 40.0},
+    {"horizontal_fov": 0.7},
+    {"fov": 40.0},
+    {"focal": 55.0},
+    {"lens": 35.0},
+    {"camera_intrinsics_px": [55.0, 55.0, 32.0, 24.0]},
+)
 
 
 def spelled(rng: Random, width: int, height: int) -> tuple[dict, list[float]]:

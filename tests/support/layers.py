@@ -2,6 +2,17 @@
 
 # A layer may import itself and every layer of a line above; layers of one line do not import each other.
 LAYERS = [
-    {"errors"}, {"kernels"}, {"_bridge"}, {"geometry"}, {"render"}, {"io", "fit"}, {"views", "synthetic", "nn"},
-    {"prepare"}, {"output"}, {"capture", "pipeline"}, {"train"}, {"eval"}, {"cli"},
-]  # fmt: skip
+    {"errors"},
+    {"kernels"},
+    {"_bridge"},
+    {"geometry"},
+    {"render"},
+    {"io", "fit"},
+    {"views", "synthetic", "nn"},
+    {"prepare"},
+    {"output"},
+    {"capture", "pipeline"},
+    {"train"},
+    {"eval"},
+    {"cli"},
+]

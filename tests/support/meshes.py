@@ -8,10 +8,22 @@ from reli3d.geometry.mesh import Mesh
 
 QUICK = ["avocado", "suzanne", "scifi_crate", "plastic_monobloc_chair_01", "abalone_shell"]
 SLOW = [
-    "boombox", "coffee_grinder", "dutch_ship_medium", "exploding_barrel", "french_horn", "horse_statue_01",
-    "numeric_keypad", "painted_wooden_cabinet_02", "painted_wooden_stool", "rune_sword", "shader_ball", "sheen_chair",
-    "sofa_03", "wicker_sphere", "wooden_table_02",
-]  # fmt: skip
+    "boombox",
+    "coffee_grinder",
+    "dutch_ship_medium",
+    "exploding_barrel",
+    "french_horn",
+    "horse_statue_01",
+    "numeric_keypad",
+    "painted_wooden_cabinet_02",
+    "painted_wooden_stool",
+    "rune_sword",
+    "shader_ball",
+    "sheen_chair",
+    "sofa_03",
+    "wicker_sphere",
+    "wooden_table_02",
+]
 
 
 def mesh_of(vertices, faces, device="cpu") -> Mesh:

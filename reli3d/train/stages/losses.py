@@ -55,15 +55,17 @@ def lpips_distance() -> Perceptual:
     try:
         import lpips
     except ImportError:
-        problem = "expected the package lpips, got none"
-        raise InputError("--perceptual", f"{problem}; pip install lpips, or use --perceptual gradients") from None
+        raise InputError(
+            "--perceptual", "expected the package lpips, got none; pip install lpips, or use --perceptual gradients"
+        ) from None
     weights = torch.hub.get_dir() + "/checkpoints/vgg16-397923af.pth"
     try:
         with open(weights, "rb"):
             pass
     except OSError:
-        problem = f"expected the weights of VGG16 at {weights}, got none"
-        raise InputError("--perceptual", f"{problem}; use --perceptual gradients") from None
+        raise InputError(
+            "--perceptual", f"expected the weights of VGG16 at {weights}, got none; use --perceptual gradients"
+        ) from None
     network = lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
 
     def distance(rendered: Tensor, observed: Tensor) -> Tensor:
