@@ -110,15 +110,21 @@ def _joined(mesh: Mesh, faces: np.ndarray, charts: parts.Charts, uv: np.ndarray)
     vertex = np.empty(len(order), np.int32)
     vertex[order] = np.cumsum(rank)
     corners = order[first]
-    device = mesh.vertices.device
-    source = torch.from_numpy(faces.ravel()[corners].astype(np.int64)).to(device)
+    return _split(mesh, faces.ravel()[corners], vertex.reshape(-1, 3), uv.reshape(-1, 2)[corners])
+
+
+def _split(mesh: Mesh, source: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> Mesh:
+    """``mesh`` with copies of its vertices ``source (V,)``, in ``faces (F, 3)``, at ``uv (V, 2)`` float32."""
+    index, faces_on, uv_on = (
+        torch.from_numpy(v).to(mesh.vertices.device) for v in (source.astype(np.int64), faces, uv)
+    )
     normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
     return Mesh(
-        vertices=mesh.vertices.index_select(0, source),  # a gradient that adds up in a fixed order
-        faces=torch.from_numpy(vertex.reshape(-1, 3)).to(device),
-        normals=normals.index_select(0, source),
-        colors=mesh.colors.index_select(0, source) if mesh.colors is not None else None,
-        uv=torch.from_numpy(uv.reshape(-1, 2)[corners]).to(device),
+        vertices=mesh.vertices.index_select(0, index),  # a gradient that adds up in a fixed order
+        faces=faces_on,
+        normals=normals.index_select(0, index),
+        colors=mesh.colors.index_select(0, index) if mesh.colors is not None else None,
+        uv=uv_on,
     )
 
 
@@ -236,16 +242,7 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
             source, faces, uv = data["source"], data["faces"], data["uv"]
     if not np.isfinite(uv).all():
         raise RuntimeError("unwrap_xatlas: expected finite texture coordinates, got NaN from xatlas; use unwrap")
-    device = mesh.vertices.device
-    index = torch.from_numpy(source.astype(np.int64)).to(device)
-    normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
-    return Mesh(
-        vertices=mesh.vertices.index_select(0, index),
-        faces=torch.from_numpy(faces.astype(np.int32)).to(device),
-        normals=normals.index_select(0, index),
-        colors=mesh.colors.index_select(0, index) if mesh.colors is not None else None,
-        uv=torch.from_numpy(uv.astype(np.float32)).to(device),
-    )
+    return _split(mesh, source, faces.astype(np.int32), uv.astype(np.float32))
 
 
 def source_vertices(whole: Mesh, mesh: Mesh) -> Tensor:
