@@ -409,7 +409,7 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     lower than the start's, within a small tolerance; if there are none, the result is ``asset``.
 
     views: in the frame of ``asset``.  seconds, steps: the budget, exactly one; with ``steps`` the result is
-    reproducible.  options: see :func:`reli3d.fit.refine.refine`.  Returns a new asset without gradients.
+    reproducible.  options: see :class:`reli3d.fit.refine.RefineOptions`.  Returns a new asset without gradients.
     Raises TypeError for a wrong type, ValueError unless exactly one of ``seconds`` and ``steps`` is given.
 
     >>> views = reli3d.load_views("photos/shoe", every=True)
@@ -419,12 +419,20 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
 
 
 @full_precision
-def refined(asset: Asset, views: Views, **options) -> Refinement:
-    """As :func:`refine`; returns the asset and the record of the fit."""
+def refined(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, bar: bool = False,
+            interrupt: Callable[[], bool] | None = None, **options) -> Refinement:  # fmt: skip
+    """As :func:`refine`; returns the asset and the record of the fit.
+
+    bar, interrupt: see :func:`reli3d.fit.refine.refine`.
+    """
     from reli3d.fit import refine as fit  # imported where it is used: it loads kernels of its own
 
     device = asset.mesh.vertices.device
-    return fit.refine(asset, views.to(device).resampled(REFINED), **{"light": views.lighting, **options})
+    chosen = fit.RefineOptions(**{"light": views.lighting, **options})
+    views_on_device = views.to(device).resampled(REFINED)
+    return fit.refine(
+        asset, views_on_device, seconds=seconds, steps=steps, options=chosen, bar=bar, interrupt=interrupt
+    )
 
 
 class Progress:

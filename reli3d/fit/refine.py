@@ -31,6 +31,21 @@ MAX_DETAIL_TEXELS = 512  # along a side of the base color's detail map
 
 
 @dataclass(frozen=True)
+class RefineOptions:
+    """Options of :func:`refine`.
+
+    resolution: of :func:`~reli3d.fit.shape.start_grid`.  cameras: optimize the poses as well.  light: of
+    :meth:`InputImages.of`; unless ``object``, the result has the lighting of view 0.
+    """
+
+    resolution: int = RESOLUTION
+    weights: losses.Weights = losses.Weights()  # noqa: RUF009 # it is frozen
+    cameras: bool = False
+    light: str | Sequence[Hashable] = "object"
+    seed: int = 0
+
+
+@dataclass(frozen=True)
 class Refinement:
     """Result of :func:`refine`.
 
@@ -86,27 +101,21 @@ def refine(
     *,
     seconds: float | None = None,
     steps: int | None = None,
-    resolution: int = RESOLUTION,
-    weights: losses.Weights | None = None,
-    cameras: bool = False,
-    light: str | Sequence[Hashable] = "object",
-    seed: int = 0,
+    options: RefineOptions = RefineOptions(),  # noqa: B008 # it is frozen
     bar: bool = False,
     interrupt: Callable[[], bool] | None = None,
 ) -> Refinement:
     """Fits surface, material and lighting of ``asset`` to posed images by inverse rendering.
 
     views: images, masks and cameras in the frame of ``asset``.  seconds, steps: the budget, exactly one;
-    with ``steps`` the result is deterministic on one CPU.  resolution: of :func:`~reli3d.fit.shape.start_grid`.
-    cameras: optimize the poses as well.  light: of :meth:`InputImages.of`; unless ``object``, the result has the
-    lighting of view 0.  bar: show progress on stderr.  interrupt: called before every step; True ends the fit with the
-    best result so far.
+    with ``steps`` the result is deterministic on one CPU.  bar: show progress on stderr.  interrupt: called before
+    every step; True ends the fit with the best result so far.
 
     The colors of :func:`held_out` views are not fitted.  :func:`~reli3d.fit.choice.chosen` selects what is kept.
     Nothing has gradients.  Raises TypeError or ValueError for mismatched shapes or devices, an invalid ``light`` or
     budget, or an asset without environment, atlas or faces.
     """
-    images, weights = InputImages.of(views, light), weights or losses.Weights()
+    images = InputImages.of(views, options.light)
     _check_asset(asset, images)
     budget = Budget(seconds, steps, interrupt=interrupt)
     if bar:
@@ -116,7 +125,7 @@ def refine(
     low, high = asset.mesh.vertices.amin(0), asset.mesh.vertices.amax(0)
     shift, scale = (low + high) / 2, 2.0 / float((high - low).max())
     first, near = _moved(asset, shift, scale), images.moved(shift, scale)
-    received = gathered(first.mesh, near.select(used), seed=seed)
+    received = gathered(first.mesh, near.select(used), seed=options.seed)
     before = view_errors(first, received, near)
     notes: list[str] = []
     if images.light_moves:
@@ -130,7 +139,7 @@ def refine(
         )
     with torch.random.fork_rng(devices=[]):
         data = FixedSurface(Start.of(first), first, received, near, used)
-        fitted = _fitted(data, _Options(resolution, weights, cameras, seed), budget, notes)
+        fitted = _fitted(data, options, budget, notes)
         kept, parts, after = chosen(fitted, used, list(held), before)
     if budget.bar is not None:
         budget.bar.close()
@@ -144,17 +153,7 @@ def refine(
     return Refinement(kept, parts, was, now, held, near.camera.c2w, tuple(notes), budget.curve, budget.counts)
 
 
-@dataclass(frozen=True)
-class _Options:
-    """Those arguments of :func:`refine` that the stages read."""
-
-    resolution: int
-    weights: losses.Weights
-    cameras: bool
-    seed: int
-
-
-def _fitted(data: FixedSurface, options: _Options, budget: Budget, notes: list[str]) -> Fitted:
+def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: list[str]) -> Fitted:
     first, images, used, seed = data.asset, data.images, data.used, options.seed
     start, weights, texels = data.start, options.weights, min(MAX_DETAIL_TEXELS, first.textures.size)
     closed = watertight(first.mesh)

@@ -14,7 +14,7 @@ from reli3d.fit.light_frame import explained_deviations, light_follows_camera
 from reli3d.fit.lighting import Lights
 from reli3d.fit.losses import Weights
 from reli3d.fit.maps import FixedSurface
-from reli3d.fit.refine import refine
+from reli3d.fit.refine import RefineOptions, refine
 from reli3d.fit.transfer import changed
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.geometry.camera import Camera
@@ -159,5 +159,5 @@ def test_light_that_moves_with_the_camera_is_detected():
 def test_light_that_moves_with_the_camera_is_reported():
     images = shaded(True)
     views = ViewBatch(linear_to_srgb(images.color), images.mask, images.camera.c2w, images.camera.intrinsics)
-    notes = refine(small_scene.ball(), views, steps=1, resolution=16).notes
+    notes = refine(small_scene.ball(), views, steps=1, options=RefineOptions(16)).notes
     assert any("set light to camera" in note for note in notes)

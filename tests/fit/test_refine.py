@@ -33,7 +33,7 @@ def start():
 
 @pytest.fixture(scope="module")
 def refined(start, views):
-    return fit.refine(start, views, steps=STEPS, resolution=24, seed=3)
+    return fit.refine(start, views, steps=STEPS, options=fit.RefineOptions(24, seed=3))
 
 
 def half_colors(asset) -> torch.Tensor:
@@ -62,7 +62,7 @@ def test_few_views_fit_the_light_and_keep_the_base_color(views):
     few = replace(views, **three, names=())
     off = []
     for weights in (Weights(), Weights(base_color=0.0)):
-        result = fit.refine(first, few, steps=30, resolution=24, weights=weights)
+        result = fit.refine(first, few, steps=30, options=fit.RefineOptions(24, weights))
         assert result.parts.light == 0.5 and result.after[0] > result.before[0] + 1.0
         off.append(float((half_colors(result.asset) / half_colors(true)).log().abs().mean()))
     assert off[0] < 0.5 * off[1]  # the base color was right at the start, the light was not
@@ -74,7 +74,7 @@ def test_the_surface_moves_towards_the_silhouettes(refined, start):
 
 
 def test_the_same_steps_and_seed_give_bitwise_identical_results(refined, start, views):
-    again = fit.refine(start, views, steps=STEPS, resolution=24, seed=3)
+    again = fit.refine(start, views, steps=STEPS, options=fit.RefineOptions(24, seed=3))
     assert torch.equal(again.asset.mesh.vertices, refined.asset.mesh.vertices)
     assert torch.equal(again.asset.textures.base_color, refined.asset.textures.base_color)
     assert torch.equal(again.asset.environment.radiance, refined.asset.environment.radiance)
@@ -104,7 +104,8 @@ def test_an_interrupt_gives_the_best_so_far(start, views, monkeypatch):
             pressed.append(True)
 
     monkeypatch.setattr(Budget, "record", pressing)
-    result = fit.refine(start, views, steps=STEPS, resolution=24, interrupt=lambda: bool(pressed))
+    options = fit.RefineOptions(24)
+    result = fit.refine(start, views, steps=STEPS, options=options, interrupt=lambda: bool(pressed))
     assert sum(result.steps.values()) < STEPS / 2 and any("interrupted" in note for note in result.notes)
     assert result.after[0] >= result.before[0] - PSNR_TOLERANCE_DB
 
@@ -112,7 +113,8 @@ def test_an_interrupt_gives_the_best_so_far(start, views, monkeypatch):
 def test_cameras_that_are_off_move_back(start, views):
     c2w = views.c2w.clone()
     c2w[:, :3, 3] += 0.03 * torch.randn(VIEWS, 3, generator=torch.Generator().manual_seed(4))
-    result = fit.refine(small_scene.ball(), replace(views, c2w=c2w), steps=90, resolution=24, cameras=True)
+    options = fit.RefineOptions(24, cameras=True)
+    result = fit.refine(small_scene.ball(), replace(views, c2w=c2w), steps=90, options=options)
     off = [(c[:, :3, 3] - views.c2w[:, :3, 3]) for c in (c2w, result.c2w)]
     # silhouettes of a ball constrain shifts across the view, hardly those along it; the common shift is ambiguous
     across = [
