@@ -34,10 +34,10 @@ class Weights:
     base_coarse: float = 0.02  # pulls the base color's coarse field to the start; divided by the number of views
     base_color: float = 20.0  # of :func:`near_base_color`; over the 4th power of the number of views with used colors
     finish: float = 0.05  # pulls roughness and metallic to the start; divided by the number of views
-    light: float = 2e-3  # pulls the lighting to the start
+    light: float = 3e-3  # pulls the lighting to the start
     light_variation: float = 2e-3  # of :func:`total_variation` of the lighting
     exposure: float = 0.1  # of squared log exposures; their mean is ambiguous with the scale of the lighting
-    demodulation: float = 0.3  # of :func:`shared_pattern`
+    demodulation: float = 0.0  # of :func:`shared_pattern`
     free_bend: float = 2e-3  # of the squared bend while the material is fitted; multiplied by the number of views
     bend: float = 20.0  # of the squared bend that is kept; divided by the squared number of views
 
