@@ -525,9 +525,9 @@ def reconstruct_folder(
     if reading.budget:
         with watch.stage("refine"):
             photographs = photographs.transformed(output)
-            fit: dict[str, Any] = {"cameras": reading.cameras, "interrupt": reading.interrupt}
+            fit: dict[str, Any] = {"cameras": reading.cameras, "interrupt": reading.interrupt, **reading.budget}
             fit["light"] = reading.lighting(photographs)
-            result = refined(asset, photographs, bar=True, **fit, **reading.budget)
+            result = refined(asset, photographs, bar=True, **fit)
             compared = comparison(asset, result.asset, shown.to(model.device))
         progress.report(result.notes)
         first, asset = asset if result.changed else None, result.asset
