@@ -37,7 +37,7 @@ class Weights:
     light: float = 3e-3  # pulls the lighting to the start
     light_variation: float = 2e-3  # of :func:`total_variation` of the lighting
     exposure: float = 0.1  # of squared log exposures; their mean is ambiguous with the scale of the lighting
-    demodulation: float = 0.0  # of :func:`shared_pattern`
+    demodulation: float = 0.0  # of :func:`shared_pattern`; off: it prevents corrections of a wrong base color too
     free_bend: float = 2e-3  # of the squared bend while the material is fitted; multiplied by the number of views
     bend: float = 20.0  # of the squared bend that is kept; divided by the squared number of views
 
