@@ -34,12 +34,12 @@ COMPONENTS, COLOR_NOISE, COLOR_SAMPLES = 5, 2.0, 3000  # of a mixture of Gaussia
 LOWEST_DENSITY = -23.0  # logarithm of a density of colors, per 1 / 255^3
 PLANE_EVIDENCE, COLOR_EVIDENCE = 4.0, 1.5  # largest log odds of a pixel, before the plane and elsewhere
 COVERED = 0.85  # probability that a pixel shows the object although a point near it on the same ray is empty
-GRIDS = 64, 96, 96  # cells along the volume's side, in each pass
+GRIDS = 64, 96, 160  # cells along the volume's side, in each pass
 LEAST_SEEN = 0.5  # fraction of the views that must show a cell
 VOLUME_SIDE = 2.0, 1.15, 1.15  # sides of the volume over those of the object so far, in each pass
 PRIOR_INSIDE, PRIOR_OUTSIDE = 3.0, 6.0  # largest log odds by the distance in pixels from the volume's silhouette
 SHADOW_HEIGHT = 0.1, 0.4  # of the object's longest side and of its height: lower cells may be a shadow on the plane
-CERTAIN = 3.0  # log odds from which GrabCut keeps a pixel
+CERTAIN = 3.0  # log odds from which GrabCut keeps a pixel whose neighbors have them too: evidence is blurred
 LIMIT_PIXELS = 12  # around the silhouette: farther out nothing is the object
 
 
@@ -304,7 +304,8 @@ def _segmented(small: _Small, evidence: np.ndarray, occupied: np.ndarray, cell: 
     away += 0.5 * small.view.focal * small.scale * cell / np.median(small.project(occupied)[1])  # cells, not centers
     odds = evidence + np.clip(away, -PRIOR_OUTSIDE, PRIOR_INSIDE)
     labels = np.where(odds > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    labels[odds > CERTAIN], labels[odds < -CERTAIN] = cv2.GC_FGD, cv2.GC_BGD
+    for certain, label in ((odds > CERTAIN, cv2.GC_FGD), (odds < -CERTAIN, cv2.GC_BGD)):
+        labels[cv2.erode(certain.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0] = label
     limit = (away > -LIMIT_PIXELS).astype(np.uint8)
     labels[limit == 0] = cv2.GC_BGD
     return grabcut(small.image, labels, limit)
