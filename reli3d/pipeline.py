@@ -270,19 +270,13 @@ def default_normalization(preset: Preset | LocalPreset) -> str:
 class ReconstructOptions:
     """Options of :func:`reconstruct`.
 
-    texture_size: texels per side, 256 to 4096.  resolution: cubes per side of the FlexiCubes grid, 16 to 256; None: the
-    preset's value.  normalization: how the object is placed in the network's cube.  ``hull``: the bounding box of the
-    visual hull is centered and its longest side scaled to 1.  ``none``: poses as stored.  ``auto``: if
-    ``views.object_box`` is set, like ``hull`` with that box; else poses as stored if the visual hull lies in the cube,
-    near its center and not much smaller (:func:`~reli3d.views.normalize.normalize`); else ``hull``.  A
-    :class:`~reli3d.views.similarity.Similarity`: the transform from the input to the model frame.  None, the default:
-    ``auto`` for the bundled network, ``none`` for the published network.  up: axis of the cameras' world frame that
-    becomes +Y: ``x``, ``y`` or ``z``, optionally with a minus sign.  uv: unwrapping method, ``project`` or ``xatlas``.
-    hero: index of the reference view.  background: image region that the lighting estimate reads, ``masked`` (the
-    object only), ``visible`` (the background too) or ``auto`` (``visible`` if all views have a background and the
-    weights were trained with it, else ``masked``).  symmetry: ``auto`` completes objects with a detected mirror plane
-    (bundled network only), or ``off``.  Raises InputError for an invalid value; ``hero`` is checked by
-    :func:`reconstruct`.
+    texture_size: texels per side, 256 to 4096.  resolution: cubes per side of the FlexiCubes grid, 16 to 256; None:
+    the preset's.  normalization: a mode of :func:`~reli3d.views.normalize.normalize` or the
+    :class:`~reli3d.views.similarity.Similarity` to the model frame; None: ``auto``, for the published network
+    ``none``.  up: axis of the world that becomes +Y, such as ``-y``.  uv: ``project`` or ``xatlas``.  hero: index of
+    the reference view.  background: what the lighting estimate reads, ``masked`` (the object), ``visible``, or
+    ``auto`` (``visible`` if all views have a background and the weights read it).  symmetry: ``auto`` completes
+    objects with a mirror plane (bundled network only), or ``off``.  Raises InputError for an invalid value.
 
     >>> options = reli3d.ReconstructOptions(texture_size=512, symmetry="off")
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe"), options=options)
@@ -345,15 +339,14 @@ def reconstruct(views: Views, *, weights: str | Network = "small", device: str =
                 options: ReconstructOptions = DEFAULT, watch: Stopwatch | None = None) -> Asset:  # fmt: skip
     """Reconstructs a relightable asset from posed images of one object.
 
-    views: 1 to 16, see :func:`reli3d.load_views`.  weights: ``small`` (the bundled network), ``official`` (the
-    published ReLi3D network, after ``reli3d download``), the path of a safetensors file, or a loaded network.  device:
-    ``cpu`` or ``cuda``, ignored for a loaded network; the asset is on the network's device.  options: see
-    :class:`ReconstructOptions`.  watch: receives the seconds of each stage.
+    views: 1 to 16, see :func:`reli3d.load_views`.  weights: ``small`` (bundled), ``official`` (published, after
+    ``reli3d download``), the path of a safetensors file, or a network.  device: ``cpu`` or ``cuda``, ignored for a
+    network; the asset is on the network's device.  watch: receives the seconds of each stage.
 
-    The asset is in the world frame and units of the cameras, rotated so that ``options.up`` is +Y.  Deterministic.
-    Runs under ``torch.no_grad``, so nothing has gradients; :func:`refine` optimizes the result.  Raises TypeError
-    unless ``views`` are Views; InputError if the masks' visual hull is empty, or for weights that cannot be read;
-    NoSurface, an InputError, if the network predicts no surface.  Source: the ReLi3D paper, ICLR 2026.
+    The asset is in the world frame and units of the cameras, rotated so that ``options.up`` is +Y.  Deterministic.  No
+    gradient; :func:`refine` optimizes the result.  Raises TypeError unless ``views`` are Views; InputError for an
+    empty visual hull or unreadable weights; NoSurface, an InputError, if the network predicts no surface.  Source: the
+    ReLi3D paper, ICLR 2026.
 
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe", views=4))
     >>> reli3d.write_glb("shoe.glb", asset)
