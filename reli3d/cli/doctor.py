@@ -16,9 +16,19 @@ import reli3d
 from reli3d.cli.exit_codes import Parser, command
 
 REQUIRED = (
-    "torch", "warp-lang", "numpy", "scipy", "pillow", "safetensors", "trimesh", "embreex", "OpenEXR", "manifold3d",
-    "xatlas", "tqdm",
-)  # fmt: skip
+    "torch",
+    "warp-lang",
+    "numpy",
+    "scipy",
+    "pillow",
+    "safetensors",
+    "trimesh",
+    "embreex",
+    "OpenEXR",
+    "manifold3d",
+    "xatlas",
+    "tqdm",
+)
 ASSETS = Path(reli3d.__file__).parent / "assets"
 PROBLEM = "PROBLEM: "  # prefix of a value that makes the package unusable
 

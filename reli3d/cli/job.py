@@ -19,9 +19,19 @@ from reli3d.output import results
 from reli3d.pipeline import FolderOptions, Progress, ReconstructOptions, reconstruct_folder
 
 STAGES = (
-    "reading", "normalize", "prepare", "symmetry", "network", "surface", "textures", "light", "frame", "refine",
-    "preview", "writing",
-)  # fmt: skip
+    "reading",
+    "normalize",
+    "prepare",
+    "symmetry",
+    "network",
+    "surface",
+    "textures",
+    "light",
+    "frame",
+    "refine",
+    "preview",
+    "writing",
+)
 
 
 class FolderJob:

@@ -173,12 +173,12 @@ def bake(
 ) -> dict[str, Tensor]:
     """Evaluates ``fn`` at the texels of an atlas; returns maps ``{name: (size, size, C)}`` float32, not clamped.
 
-    mesh: with ``uv``, baked in [0, 1].  size: texels per side, 1 to 16384; row 0: v = 0.  fn: ``fn(position (N, 3),
-    normal (N, 3))``, N at most ``chunk``, without gradient, returns ``{name: (N, C)}`` or one tensor, "value".  texels:
-    from :func:`~reli3d.geometry.bake.rasterize_texels`.  tangents: also pass ``(N, 4)``.  values: vertex attributes
-    ``(V, C)``, interpolated as the last argument.  fill: from the nearest covered texel, else 0.
+    mesh: with ``uv``, baked in [0, 1].  size: texels per side, 1 to 16384; row 0 is v = 0.  fn: ``fn(position (N, 3),
+    normal (N, 3))``, N at most ``chunk``, without gradient; returns ``{name: (N, C)}`` or one tensor, named "value".
+    texels: from :func:`~reli3d.geometry.bake.rasterize_texels`.  tangents: also pass ``(N, 4)``.  values: vertex
+    attributes ``(V, C)``, interpolated, passed last.  fill: copy the nearest covered texel to uncovered ones.
 
-    Raises TypeError for a wrong type or dtype; ValueError without ``uv`` or covered texels, or for wrong results.
+    Raises TypeError for a wrong type or dtype, ValueError without ``uv`` or covered texels, or for wrong results.
 
     >>> maps = reli3d.bake(mesh, 64, lambda position, normal: 0.5 + 0.5 * normal)
     >>> textures = reli3d.TextureSet(maps["value"], roughness=0.5, metallic=0.0)

@@ -108,13 +108,13 @@ def extract_surface(
 ) -> Mesh:
     """Isosurface ``sdf == 0`` of a grid over ``[-radius, radius]^3`` by FlexiCubes (Shen et al. 2023), without normals.
 
-    sdf: ``(X+1, Y+1, Z+1)`` float32, negative inside.  radius: one or three numbers.  deformation: ``(*sdf.shape, 3)``,
-    fractions of the box sides.  alpha ``(K, 8)``, beta ``(K, 12)``, gamma ``(K,)``: positive weights of cubes' corners,
-    edges and quads; all, or ``cubes (K,)`` from :func:`surface_cubes`.  closed: capped.  center: four triangles per
-    quad.
+    sdf: ``(X+1, Y+1, Z+1)`` float32, negative inside.  radius: one or three numbers.  deformation: ``(*sdf.shape,
+    3)``, fractions of the box sides.  alpha ``(K, 8)``, beta ``(K, 12)``, gamma ``(K,)``: positive weights of corners,
+    edges and quads of all cubes or of ``cubes (K,)``, from :func:`surface_cubes`; None: 1.  closed: capped at the box.
+    center: four triangles per quad.
 
     Gradients reach sdf, deformation, alpha, beta and, with ``center``, gamma.  Raises TypeError for a wrong dtype,
-    ValueError for wrong shapes or values, non-finite vertices, 2^31 grid vertices.
+    ValueError for wrong shapes or values, or 2^31 vertices.
 
     >>> x = torch.linspace(-1, 1, 17)
     >>> ball = reli3d.extract_surface((x**2 + x[:, None] ** 2 + x[:, None, None] ** 2).sqrt() - 0.5, radius=1.0)

@@ -29,9 +29,15 @@ AGREE = 0.02  # relative difference up to which two spellings of one focal lengt
 MAX_SKEW = 1e-3  # of the focal length: half a pixel across an image
 _PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE", "PERSP")
 _MATRICES = (
-    "intrinsics", "K", "intrinsic_matrix", "intrinsics_matrix", "intrinsic", "camera_intrinsics", "camera_matrix",
+    "intrinsics",
+    "K",
+    "intrinsic_matrix",
+    "intrinsics_matrix",
+    "intrinsic",
+    "camera_intrinsics",
+    "camera_matrix",
     "cam_K",
-)  # fmt: skip
+)
 _FOCALS = (("fl_x", "fl_y"), ("fx", "fy"))
 _ANGLES = (("x_fov", "y_fov", math.pi / 180), ("camera_angle_x", "camera_angle_y", 1.0))
 _FOVS = ("camera_fov", "fov_rad")

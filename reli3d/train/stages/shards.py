@@ -16,8 +16,15 @@ from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.views import Chooser, ObjectViews, Samples, sample_views
 
 STORED_TENSORS = (
-    "images", "c2w", "intrinsics", "view_material", "view_normal", "view_depth", "environment", "finish_known",
-)  # fmt: skip
+    "images",
+    "c2w",
+    "intrinsics",
+    "view_material",
+    "view_normal",
+    "view_depth",
+    "environment",
+    "finish_known",
+)
 
 
 def to_tensors(views: ObjectViews) -> dict[str, Tensor]:
