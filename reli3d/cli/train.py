@@ -22,7 +22,7 @@ OF_LOOP = ("steps", "minutes", "batch", "rate", "seed", "save_every", "tensorboa
 OF_NETWORK = ("weights", "validation", "export", "license", "max_views", "bfloat16", "device")
 OF_SMALL = (*OF_NETWORK, "points", "pyramid_rate", "maps", "material_bins")
 OF_CONFIG = ("image_size", "patch", "targets", "lobes", "resolution", "samples", "shadows")  # of a StageConfig
-OF_PAPER = (*OF_NETWORK, *OF_CONFIG, "preset", "prior", "perceptual", "checkpointing", "shard")
+OF_PAPER = (*OF_NETWORK, *OF_CONFIG, "preset", "prior", "perceptual", "checkpointing")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -90,7 +90,6 @@ def parser() -> argparse.ArgumentParser:
     )
     paper.add_argument("--perceptual", choices=("gradients", "lpips"))
     paper.add_argument("--checkpointing", action="store_true", help="recompute the trunk's layers in the backward pass")
-    paper.add_argument("--shard", action="store_true", help="divide the trunk among the processes of torchrun (FSDP)")
     for name in ("patch", "targets", "lobes", "resolution"):
         paper.add_argument(f"--{name}", type=int)
     paper.add_argument("--samples", type=int, nargs=3, metavar=("LIGHT", "NORMALS", "COSINE"))
@@ -311,7 +310,7 @@ def main(argv: list[str] | None = None) -> int:
     if "export" in args:
         print(weights.save(args.export, export(args, stage), license=getattr(args, "license", "not stated")).path)
         return 0
-    settings = given(args, *OF_LOOP, "shard")
+    settings = given(args, *OF_LOOP)
     if "tensorboard" in settings:
         settings["tensorboard"] = str(settings["tensorboard"])
     train(stage, stage.options(str(args.output), **settings), workers)

@@ -13,9 +13,7 @@ from reli3d.errors import InputError, shown
 from reli3d.io.files import file_size
 from reli3d.nn.presets import SMALL, LocalPreset, from_json, to_json
 from reli3d.nn.weights import BROKEN_TORCH_FILE, check_keys
-from reli3d.train.sharded import gathered, scattered
 from reli3d.train.stage import Stage
-from reli3d.train.workers import Workers
 
 REMEDY = "name another output folder, and this file by --weights"
 
@@ -37,17 +35,12 @@ def save(
     seconds: float,
     about: dict[str, Any],
     measures: dict[str, float],
-    workers: Workers,
-) -> dict[str, Tensor]:
-    """Writes ``folder/state.pt`` atomically and returns the averaged weights.
-
-    All processes must call it; the first one writes.
-    """
-    first = workers.rank == 0
+) -> None:
+    """Writes ``folder/state.pt`` atomically."""
     state = {
-        "model": gathered(stage.model.state_dict(), first),
-        "optimizer": gathered(optimizer.state_dict(), first),
-        "average": gathered(average, first),
+        "model": stage.model.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "average": average,
         "step": step,
         "seconds": seconds,
         "stage": stage.name,
@@ -55,13 +48,11 @@ def save(
         "about": json.dumps(about, sort_keys=True),
         "measures": measures,
     }
-    if first:
-        with open(folder / "state.tmp", "wb") as file:
-            torch.save(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(folder / "state.tmp", folder / "state.pt")
-    return state["average"]
+    with open(folder / "state.tmp", "wb") as file:
+        torch.save(state, file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(folder / "state.tmp", folder / "state.pt")
 
 
 def load(path: Path) -> dict[str, Any]:
@@ -119,13 +110,3 @@ def check_shapes(
     """Raise InputError unless ``state`` has the tensors of ``model`` but for those ``missing_parameters``."""
     shapes = {k: tuple(v.shape) for k, v in model.state_dict().items() if k not in (missing_parameters or ())}
     check_keys(path, {k: tuple(v.shape) for k, v in state.items()}, shapes)
-
-
-def restore(optimizer: torch.optim.Optimizer, state: dict) -> None:
-    """Loads the optimizer state of a checkpoint, sharded where the parameters are."""
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    for k, values in state["state"].items():
-        state["state"][k] = {name: scattered(value, parameters[k]) for name, value in values.items()}
-    for saved, group in zip(state["param_groups"], optimizer.param_groups, strict=True):
-        saved |= {key: group[key] for key in ("foreach", "fused")}
-    optimizer.load_state_dict(state)

@@ -22,7 +22,6 @@ from reli3d.errors import InputError
 from reli3d.io.images import write_png
 from reli3d.train import checkpoint
 from reli3d.train.log import Board, Log, write_curves
-from reli3d.train.sharded import clip_gradients, replicated, scattered, shard
 from reli3d.train.stage import Options, Stage
 from reli3d.train.workers import Workers
 
@@ -87,8 +86,6 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
     """
     workers = workers or Workers()
     model, folder, first = stage.model, Path(options.output), workers is None or workers.rank == 0
-    if options.shard and (workers.count == 1 or not stage.layers()):
-        raise InputError("shard", "expected several processes and a stage that can be sharded; start with torchrun")
     if options.batch % workers.count:
         raise InputError("batch", f"expected a multiple of the {workers.count} processes, got {options.batch}")
     folder.mkdir(parents=True, exist_ok=True)
@@ -96,18 +93,14 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
     if (folder / "state.pt").exists():
         state = checkpoint.to_resume(folder / "state.pt", stage, parameter_groups(stage, options.weight_decay))
         model.load_state_dict(state["model"])
-    if options.shard:
-        shard(stage.layers(), next(model.parameters()).device)
     groups = parameter_groups(stage, options.weight_decay)
     trained = [p for group in groups for p in group["params"]]
-    # torch's kernels for many tensors at once do not mix sharded and whole tensors
-    kernels = {"foreach": False} if options.shard else {"fused": True}
-    optimizer = stage.optimizer(groups, lr=options.rate, betas=(0.9, 0.98), **kernels)
+    optimizer = stage.optimizer(groups, lr=options.rate, betas=(0.9, 0.98), fused=True)
     step, seconds, average = 0, 0.0, {k: v.detach().clone() for k, v in model.state_dict().items()}
     if state:
         step, seconds = state["step"], state["seconds"]
-        average = {k: scattered(v, average[k]) for k, v in state["average"].items()}
-        checkpoint.restore(optimizer, state["optimizer"])
+        average = {k: v.to(average[k].device) for k, v in state["average"].items()}
+        optimizer.load_state_dict(state["optimizer"])
         state.clear()
     measures = stage.measures()
     about = {"stage": stage.name, "processes": workers.count, **asdict(options), **stage.configuration()}
@@ -115,8 +108,8 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
     board = Board(options.tensorboard, step) if first and options.tensorboard else None
     began, bad = time.monotonic() - seconds, 0
     sums = torch.zeros(2 * len(stage.weights) + 2, dtype=torch.float64)
-    if step == 0:
-        checkpoint.save(folder, stage, optimizer, average, step, seconds, about, measures, workers)
+    if step == 0 and first:
+        checkpoint.save(folder, stage, optimizer, average, step, seconds, about, measures)
     bar = tqdm(total=100, disable=None if first else True, bar_format="{desc} {percentage:3.0f}% {bar}")
     while (done := progress(options, step, seconds)) < 1.0:
         rate = rate_at(options, step, done)
@@ -126,8 +119,8 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
         torch.manual_seed((options.seed << 32) + step)  # random losses draw the same numbers after resuming
         values = accumulate(stage, stage.batch(step, range(workers.rank, options.batch, workers.count)))
         clock = torch.tensor([time.monotonic() - began], dtype=torch.float64)
-        values = workers.average(replicated(trained), torch.cat([values, clock]).float()).double()
-        norm = clip_gradients(trained, options.clip)
+        values = workers.average(trained, torch.cat([values, clock]).float()).double()
+        norm = nn.utils.clip_grad_norm_(trained, options.clip)
         bad = 0 if torch.isfinite(norm) else bad + 1
         if not bad:
             optimizer.step()
@@ -151,10 +144,10 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
                 board.numbers(row)
         if step % options.save_every == 0 or last:
             measures = stage.measures()
-            whole = checkpoint.save(folder, stage, optimizer, average, step, seconds, about, measures, workers)
             if log:
+                checkpoint.save(folder, stage, optimizer, average, step, seconds, about, measures)
                 write_curves(folder / "log.jsonl", folder / "curves.png")
-                image = stage.validation(whole)
+                image = stage.validation(average)
                 if image is not None:
                     write_png(folder / "validation.png", image)
                     if board:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,6 @@ class Options:
     save_every: int = 200  # steps
     log_every: int = 10  # steps
     bad_steps: int = 20  # consecutive steps with non-finite gradients that end the run with an error
-    shard: bool = False  # divide parameters, gradients and optimizer moments of ``Stage.layers`` among the processes
     tensorboard: str = ""  # folder of event files; "": none
 
 
@@ -70,10 +69,6 @@ class Stage(ABC):
     def validation(self, average: dict[str, Tensor]) -> np.ndarray | None:
         """Image ``(H, W, 3)`` uint8 of reconstructions by the averaged weights, or None."""
         return None
-
-    def layers(self) -> list[nn.Module]:
-        """Modules whose parameters ``Options.shard`` divides among the processes."""
-        return []
 
     def configuration(self) -> dict[str, Any]:
         """Values that are logged with a run in addition to :class:`Options`."""

@@ -13,7 +13,7 @@ from reli3d.nn.model import Reconstructor
 from reli3d.train.stage import Stage
 from reli3d.train.stages.config import TINY, StageConfig
 from reli3d.train.stages.losses import perceptual
-from reli3d.train.stages.step import checkpointed, encode, object_losses, renderings, trunk_layers
+from reli3d.train.stages.step import checkpointed, encode, object_losses, renderings
 from reli3d.train.stages.surface import surface
 from reli3d.train.stages.views import Draw, Source, draw
 
@@ -87,9 +87,6 @@ class PaperStage(Stage):
 
     def losses(self, item: tuple[int, int]) -> dict[str, Tensor]:
         return object_losses(self.model, self.drawn(*item), self.config, self.distance, bfloat16=self.bfloat16)
-
-    def layers(self) -> list[torch.nn.Module]:
-        return trunk_layers(self.model)
 
     def configuration(self) -> dict[str, Any]:
         return self._numbers

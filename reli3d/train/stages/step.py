@@ -101,7 +101,7 @@ def total(terms: dict[str, Tensor], stage: StageConfig) -> Tensor:
 
 
 def trunk_layers(model: Reconstructor) -> list[Any]:
-    """The layers of the encoders and transformers: the units of sharding and of gradient checkpointing."""
+    """The layers of the encoders and transformers: the units of gradient checkpointing."""
     layers: list[Any] = [
         *model.encoder.model.encoder.layer,
         *model.illumination.encoder.model.encoder.layer,
