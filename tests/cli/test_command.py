@@ -20,9 +20,9 @@ from tests.support.processes import heed_signals
 def test_help_names_every_command_and_the_old_names(capsys):
     assert main.main([]) == 0
     text = capsys.readouterr().out
-    for name in ("infer", "view", "check", "render", "download", "data", "train", "eval", "tables", "doctor"):
+    for name in ("infer", "view", "check", "render", "download", "data", "train", "tables", "doctor"):
         assert re.search(rf"^  {name} ", text, re.MULTILINE)
-    for name in ("infer", "render", "data", "train", "eval", "tables"):
+    for name in ("infer", "render", "data", "train", "tables"):
         assert f"reli3d-{name}" in text
 
 
@@ -114,7 +114,7 @@ def test_view_of_the_folder_above_names_the_one_below(tmp_path, capsys):
 
 
 def test_help_lists_defaults(capsys):
-    for name in ("infer", "render", "data render", "data pack", "eval"):
+    for name in ("infer", "render", "data render", "data pack", "tables"):
         with pytest.raises(SystemExit):
             main.main([*name.split(), "--help"])
         text = " ".join(capsys.readouterr().out.split())
