@@ -10,7 +10,6 @@ from reli3d.cli.exit_codes import Parser, command
 COMMANDS = {  # module of reli3d.cli, purpose
     "infer": ("infer", "photographs with cameras to a relightable asset (also reli3d-infer)"),
     "capture": ("capture", "photographs or a video without cameras to an object folder"),
-    "view": ("view", "show a reconstruction in the browser"),
     "check": ("checking", "check the cameras and masks of a folder without reconstruction"),
     "render": ("render", "views and turntables of a GLB under any light (also reli3d-render)"),
     "export": ("export", "convert a GLB to OBJ, USDZ or GLB, with fewer triangles or smaller textures"),
