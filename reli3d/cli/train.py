@@ -40,7 +40,7 @@ def parser() -> argparse.ArgumentParser:
         help="folders of samples; for the stages of the ReLi3D paper also captures; for light_prior "
         "environment maps, .npz",
     )
-    p.add_argument("output", type=Path, help="folder of the checkpoint, the log, the curves and validation images")
+    p.add_argument("output", type=Path, help="folder of the checkpoint, the log and validation images")
     p.add_argument(
         "--stage",
         default="small",

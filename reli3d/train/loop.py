@@ -21,7 +21,7 @@ from tqdm import tqdm
 from reli3d.errors import InputError
 from reli3d.io.images import write_png
 from reli3d.train import checkpoint
-from reli3d.train.log import Board, Log, write_curves
+from reli3d.train.log import Board, Log
 from reli3d.train.stage import Options, Stage
 from reli3d.train.workers import Workers
 
@@ -146,7 +146,6 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
             measures = stage.measures()
             if log:
                 checkpoint.save(folder, stage, optimizer, average, step, seconds, about, measures)
-                write_curves(folder / "log.jsonl", folder / "curves.png")
                 image = stage.validation(average)
                 if image is not None:
                     write_png(folder / "validation.png", image)

@@ -15,7 +15,7 @@ from torch import Tensor
 class Options:
     """Options of the training loop, for every stage."""
 
-    output: str  # folder of state.pt, log.jsonl, curves.png and validation.png
+    output: str  # folder of state.pt, log.jsonl and validation.png
     steps: int = 20_000
     minutes: float = math.inf  # of training; the schedule ends at ``steps`` or ``minutes``, whichever is first
     batch: int = 4  # objects per step, over all processes

@@ -19,7 +19,7 @@ from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
 from reli3d.nn.weights import load_model
 from reli3d.train import checkpoint
-from reli3d.train.log import HEIGHT, Log, write_curves
+from reli3d.train.log import Log
 from reli3d.train.loop import accumulate, train
 from reli3d.train.stages.config import StageConfig
 from reli3d.train.stages.losses import gradients
@@ -76,7 +76,7 @@ def test_a_run_learns_logs_and_draws(folder, tmp_path):
     found = rows(tmp_path)
     assert found[0]["config"]["config"]["lobes"] == 16 and found[-1]["step"] == 16
     assert {"loss", "image", "material", "normal", "sign", "neutral"} < set(found[-1]) and "latent" not in found[-1]
-    assert (tmp_path / "curves.png").exists() and (tmp_path / "validation.png").exists()
+    assert (tmp_path / "validation.png").exists()
     state = checkpoint.load(tmp_path / "state.pt")
     assert json.loads(state["about"]) == found[0]["config"] and state["measures"] == {"surface": 1.0}
 
@@ -286,16 +286,6 @@ def test_the_strategies_of_a_stage_can_be_chosen(folder, tmp_path):
     assert config.samples == (16, 0, 0) and not config.shadows
     plain = paper_stage(parsed(call[:4])).config
     assert plain.samples == (6, 8, 2) and plain.shadows
-
-
-def test_curves_omit_terms_without_finite_values(tmp_path):
-    rows = [{"step": k, "loss": 1.0 / k, "norm": float("nan"), "rate": 0.1, "image": k - 1.0} for k in (1, 2, 3)]
-    (tmp_path / "log").write_text("".join(json.dumps(r) + "\n" for r in rows))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        write_curves(tmp_path / "log", tmp_path / "curves.png")
-    with Image.open(tmp_path / "curves.png") as sheet:  # three panels are one row, four would be two
-        assert sheet.height == HEIGHT
 
 
 def test_no_option_is_the_beginning_of_one_of_torchruns():
