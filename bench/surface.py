@@ -8,7 +8,7 @@ from bench.peers.flexicubes_torch import cube_list, flexicubes
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.mesh import largest_components
-from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.surface import CubeWeights, extract_surface
 
 
 def offset(p):
@@ -41,7 +41,7 @@ def extraction(device, n, backward):
     leaves = [sdf, *weights.values()]
 
     def step():
-        mesh = extract_surface(sdf, radius=0.87, gamma=gamma, **weights)
+        mesh = extract_surface(sdf, radius=0.87, weights=CubeWeights(gamma=gamma, **weights))
         return torch.autograd.grad(mesh.vertices.square().sum(), leaves) if backward else mesh
 
     return step, {"faces": len(extract_surface(sdf.detach(), radius=0.87).faces)}

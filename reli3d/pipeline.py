@@ -100,12 +100,7 @@ def _free_surface(field: TriplaneField, resolution: int) -> Mesh:
     flat = _grid(resolution, radius, field.maps.images.device).reshape(-1, 3)
     sdf = field.grid_sdf(flat[: resolution + 1, 2])
     _check_signs(sdf)
-    found = field.cube_weights(flat, sdf)
-    names = ("deformation", "alpha", "beta", "gamma", "cubes")
-    deformation, alpha, beta, gamma, cubes = (found[name] for name in names)
-    return extract_surface(
-        sdf, radius=radius, deformation=deformation, alpha=alpha, beta=beta, gamma=gamma, cubes=cubes
-    )
+    return extract_surface(sdf, radius=radius, weights=field.cube_weights(flat, sdf))
 
 
 def _bounded_surface(field: LocalField, resolution: int) -> Mesh:

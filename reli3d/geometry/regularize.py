@@ -10,6 +10,7 @@ from torch import Tensor
 
 from reli3d._bridge import check
 from reli3d.geometry import surface
+from reli3d.geometry.surface import UNIT_WEIGHTS, CubeWeights
 from reli3d.kernels.flexicubes import SDF_MIN
 
 
@@ -17,10 +18,7 @@ def vertex_deviation(
     sdf: Tensor,
     *,
     radius: float | Sequence[float],
-    deformation: Tensor | None = None,
-    alpha: Tensor | None = None,
-    beta: Tensor | None = None,
-    cubes: Tensor | None = None,
+    weights: CubeWeights = UNIT_WEIGHTS,
     closed: bool = True,
 ) -> Tensor:
     """L_dev ``(D,)`` of the dual vertices, in units of ``radius``; the mean is the loss.
@@ -30,8 +28,9 @@ def vertex_deviation(
     (without centers) are those of :func:`reli3d.geometry.surface.extract_surface`.  Gradients reach sdf, deformation,
     alpha and beta, except through distances of 0.  A field without surface gives an empty tensor, whose mean is NaN.
     """
-    extent = surface.check_fields(sdf, radius, deformation, alpha, beta, None, cubes)
-    t, padded, _ = surface.topology_of(sdf.detach().contiguous(), cubes, closed)
+    extent = surface.check_fields(sdf, radius, weights)
+    deformation = weights.deformation
+    t, padded, _ = surface.topology_of(sdf.detach().contiguous(), weights.cubes, closed)
     if t.pad:
         padded = torch.nn.functional.pad(sdf, (1,) * 6, value=1.0)
     elif sdf.requires_grad:
@@ -52,12 +51,12 @@ def vertex_deviation(
         at = row.clamp(min=0) * values.shape[1] + column
         return torch.where(row >= 0, values.reshape(-1).index_select(0, at), 1.0)
 
-    ends, weights, positions = [], [], []
+    ends, alphas, positions = [], [], []
     for end in table["ends"].view(12, 2).long()[edge].unbind(1):
         offset = torch.stack([end & 1, end >> 1 & 1, end >> 2], -1)
         at_padded = t.cells.long()[cell] + (offset * step).sum(-1)
         ends.append(padded.reshape(-1).index_select(0, at_padded))
-        weights.append(weight(alpha, end))
+        alphas.append(weight(weights.alpha, end))
         vertex = corner[cell, end]
         nz = t.cubes[2] + 1
         at = torch.stack([vertex // ((t.cubes[1] + 1) * nz), vertex // nz % (t.cubes[1] + 1), vertex % nz], -1)
@@ -67,12 +66,12 @@ def vertex_deviation(
         )
     tiny = torch.maximum(*(v.detach().abs() for v in ends)) < SDF_MIN
     # float64 from here on: field values and weights have any magnitude, and distances are differences of positions
-    values = [torch.where(tiny, v.detach(), v).double() * a for v, a in zip(ends, weights, strict=True)]
+    values = [torch.where(tiny, v.detach(), v).double() * a for v, a in zip(ends, alphas, strict=True)]
     fraction = values[0] / (values[0] - values[1])
     crossing = torch.lerp(positions[0], positions[1], fraction[:, None]) * (2.0 * size.new_tensor(extent))
 
     total = int(t.counts.sum())
-    of_edge, none = weight(beta, edge).double(), size.new_zeros(total)
+    of_edge, none = weight(weights.beta, edge).double(), size.new_zeros(total)
     mass = none.index_add(0, owner, of_edge)
     vertex = size.new_zeros(total, 3).index_add(0, owner, crossing * of_edge[:, None]) / mass[:, None]
     if not bool(torch.isfinite(vertex.detach()).all()):

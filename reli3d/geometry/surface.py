@@ -24,6 +24,20 @@ from reli3d.kernels.flexicubes_tables import tables
 
 
 @dataclass(frozen=True)
+class CubeWeights:
+    """FlexiCubes' parameters of a grid, float32; None: no offsets, or weights of 1."""
+
+    deformation: Tensor | None = None  # (X + 1, Y + 1, Z + 1, 3) offsets of the grid vertices, fractions of the box
+    alpha: Tensor | None = None  # (K, 8) positive weights of corners
+    beta: Tensor | None = None  # (K, 12) positive weights of edges
+    gamma: Tensor | None = None  # (K,) positive weights of quads
+    cubes: Tensor | None = None  # (K,) int64, from surface_cubes; None: all cubes of the grid
+
+
+UNIT_WEIGHTS = CubeWeights()
+
+
+@dataclass(frozen=True)
 class _Topology:
     """Connectivity of the extracted surface, integer; constant under differentiation."""
 
@@ -98,20 +112,14 @@ def extract_surface(
     sdf: Tensor,
     *,
     radius: float | Sequence[float],
-    deformation: Tensor | None = None,
-    alpha: Tensor | None = None,
-    beta: Tensor | None = None,
-    gamma: Tensor | None = None,
-    cubes: Tensor | None = None,
+    weights: CubeWeights = UNIT_WEIGHTS,
     closed: bool = True,
     center: bool = False,
 ) -> Mesh:
     """Isosurface ``sdf == 0`` of a grid over ``[-radius, radius]^3`` by FlexiCubes (Shen et al. 2023), without normals.
 
-    sdf: ``(X+1, Y+1, Z+1)`` float32, negative inside.  radius: one or three numbers.  deformation: ``(*sdf.shape,
-    3)``, fractions of the box sides.  alpha ``(K, 8)``, beta ``(K, 12)``, gamma ``(K,)``: positive weights of corners,
-    edges and quads of all cubes or of ``cubes (K,)``, from :func:`surface_cubes`; None: 1.  closed: capped at the box.
-    center: four triangles per quad.
+    sdf: ``(X+1, Y+1, Z+1)`` float32, negative inside.  radius: one or three numbers.  weights: a
+    :class:`~reli3d.geometry.surface.CubeWeights`.  closed: capped at the box.  center: four triangles per quad.
 
     Gradients reach sdf, deformation, alpha, beta and, with ``center``, gamma.  Raises TypeError for a wrong dtype,
     ValueError for wrong shapes or values, or 2^31 vertices.
@@ -119,9 +127,9 @@ def extract_surface(
     >>> x = torch.linspace(-1, 1, 17)
     >>> ball = reli3d.extract_surface((x**2 + x[:, None] ** 2 + x[:, None, None] ** 2).sqrt() - 0.5, radius=1.0)
     """
-    sdf, deformation, alpha, beta, gamma = (tensor_of(v) for v in (sdf, deformation, alpha, beta, gamma))
-    cubes = tensor_of(cubes, torch.int64)
-    extent = check_fields(sdf, radius, deformation, alpha, beta, gamma, cubes)
+    sdf, cubes, gamma = tensor_of(sdf), tensor_of(weights.cubes, torch.int64), tensor_of(weights.gamma)
+    deformation, alpha, beta = (tensor_of(v) for v in (weights.deformation, weights.alpha, weights.beta))
+    extent = check_fields(sdf, radius, CubeWeights(deformation, alpha, beta, gamma, cubes))
     topology, padded, crossed = topology_of(sdf.detach().contiguous(), cubes, closed)
     scale = tuple(2.0 * float(r) for r in extent)
     vertices = _DualVertices.apply(topology, scale, padded, sdf, deformation, alpha, beta)
@@ -137,30 +145,20 @@ def extract_surface(
     return Mesh(vertices, faces.reshape(-1, 3))
 
 
-def check_fields(
-    sdf: Tensor,
-    radius: float | Sequence[float],
-    deformation: Tensor | None,
-    alpha: Tensor | None,
-    beta: Tensor | None,
-    gamma: Tensor | None,
-    cubes: Tensor | None,
-) -> list[float]:
+def check_fields(sdf: Tensor, radius: float | Sequence[float], weights: CubeWeights) -> list[float]:
     """The three radii.  Raises the errors of :func:`extract_surface` for invalid arguments."""
     _check_sdf(sdf)
     size = tuple(n - 1 for n in sdf.shape)
     extent = [radius] * 3 if isinstance(radius, (int, float)) else list(radius)
     if len(extent) != 3 or not all(0.0 < r < float("inf") for r in extent):
         raise ValueError(f"radius: expected one or three positive numbers, got {radius}")
-    n_cubes = size[0] * size[1] * size[2]
-    if cubes is not None:
-        check("cubes", cubes, like=sdf, dtype=torch.int64)
-    for name, value, shape in (
-        ("deformation", deformation, (*sdf.shape, 3)),
-        ("alpha", alpha, (n_cubes if cubes is None else len(cubes), 8)),
-        ("beta", beta, (n_cubes if cubes is None else len(cubes), 12)),
-        ("gamma", gamma, (n_cubes if cubes is None else len(cubes),)),
-    ):
+    count = size[0] * size[1] * size[2]
+    if weights.cubes is not None:
+        check("cubes", weights.cubes, like=sdf, dtype=torch.int64)
+        count = len(weights.cubes)
+    shapes = {"deformation": (*sdf.shape, 3), "alpha": (count, 8), "beta": (count, 12), "gamma": (count,)}
+    for name, shape in shapes.items():
+        value = getattr(weights, name)
         if value is not None:
             check(name, value, like=sdf)
             if tuple(value.shape) != tuple(shape):

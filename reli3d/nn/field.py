@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from reli3d.geometry.hull import hull_distance, hull_grid
-from reli3d.geometry.surface import surface_cubes, surface_points
+from reli3d.geometry.surface import CubeWeights, surface_cubes, surface_points
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.view_features import ViewMaps
@@ -93,7 +93,7 @@ class TriplaneField(Field):
         return self.model.sdf(self.model.grid_density(self.code, axis))
 
     @torch.no_grad()
-    def cube_weights(self, points: Tensor, sdf: Tensor) -> dict[str, Tensor]:
+    def cube_weights(self, points: Tensor, sdf: Tensor) -> CubeWeights:
         """Deformation and weights for ``extract_surface``, evaluated only at the surface cubes.
 
         points: ``(N, 3)``, the grid points in the order of ``sdf``.
@@ -106,7 +106,7 @@ class TriplaneField(Field):
         corner = torch.cat([r["flexicubes"][0] for r in raw])
         merged = [model.merger(corner[part]) for part in rows.split(CHUNK)]
         weights = {name: torch.cat([getattr(m, name) for m in merged]) for name in ("alpha", "beta", "gamma")}
-        return {"deformation": offset.reshape(*sdf.shape, 3), "cubes": cubes, **weights}
+        return CubeWeights(offset.reshape(*sdf.shape, 3), cubes=cubes, **weights)
 
     def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
         values = {k: v[0] for k, v in self.model.query(self.code, position[None], MATERIAL).items()}

@@ -89,14 +89,12 @@ def render_asset(
     shadows: bool = True,
     background: str = "transparent",
     scene: RayScene | None = None,
-    progress: Callable[[float], None] | None = None,
 ) -> Render:
     """Renders ``asset``, or several that shadow each other, under an environment with direct lighting and shadows.
 
     Without textures: a dielectric with base color and roughness 0.5.  environment: None: the first of an asset.
     supersampling: k x k camera rays per pixel, each with all samples.  background: ``transparent`` or ``environment``
-    (then save ``radiance``, not ``rgba``).  scene: of the meshes, concatenated.  progress: called with the completed
-    fraction.
+    (then save ``radiance``, not ``rgba``).  scene: of the meshes, concatenated.
 
     Gradients as in :func:`surface_points` and :func:`shade`, at constant hits and visibility; depth's also reach the
     camera; silhouettes' need :func:`antialias`.  Raises TypeError for a wrong type; ValueError without environment or
@@ -114,7 +112,6 @@ def render_asset(
         shadows=shadows,
         background=background,
         scene=scene,
-        progress=progress,
     )
     return image
 
@@ -130,7 +127,6 @@ def render_lights(
     shadows: bool = True,
     background: str = "transparent",
     scene: RayScene | None = None,
-    progress: Callable[[float], None] | None = None,
 ) -> list[Render]:
     """:func:`render_asset` under each of ``environments``, bitwise equal to single calls.
 
@@ -149,8 +145,6 @@ def render_lights(
         part = Camera(fine.c2w, fine.intrinsics - fine.intrinsics.new_tensor([0.0, 0.0, 0.0, row]), fine.width, rows)
         layers = _band(parts, part, lights, scene, row * fine.width, shadows, background, options)
         bands.append([_resolve(layer, supersampling) for layer in layers])  # one at a time: they are large
-        if progress is not None:
-            progress((row + rows) / fine.height)
     *radiances, alpha, base_color, orm, normal, position, depth = (torch.cat(p) for p in zip(*bands))
     cover = alpha.clamp(min=1e-6)  # alpha is 0 or at least 1 / supersampling^2
     roughness, metallic = (orm / cover).unbind(-1)

@@ -11,7 +11,7 @@ from reli3d.geometry.decimate import decimate
 from reli3d.geometry.mesh import Mesh, report, vertex_normals, volume
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
-from reli3d.geometry.surface import extract_surface, surface_cubes
+from reli3d.geometry.surface import CubeWeights, extract_surface, surface_cubes
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.io.glb import glb_bytes
 from reli3d.nn.weights import load, locate, save
@@ -27,7 +27,7 @@ NOTHING = Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32))
 def test_a_field_without_a_change_of_sign_has_no_faces_and_gradients_of_zero(device, value, closed, center):
     sdf = torch.full(SHAPE, value, device=device).requires_grad_()
     weights = {k: v.requires_grad_() for k, v in random_weights(SHAPE, 0, device).items()}
-    mesh = extract_surface(sdf, radius=1.0, closed=closed, center=center, **weights)
+    mesh = extract_surface(sdf, radius=1.0, closed=closed, center=center, weights=CubeWeights(**weights))
     assert mesh.vertices.shape == (0, 3) and mesh.faces.shape == (0, 3) and mesh.vertices.device == sdf.device
     assert len(surface_cubes(sdf)) == 0
     leaves = [sdf, *(weights[k] for k in ("deformation", "alpha", "beta"))]
@@ -35,9 +35,10 @@ def test_a_field_without_a_change_of_sign_has_no_faces_and_gradients_of_zero(dev
         assert g.shape == leaf.shape and float(g.abs().max()) == 0.0
     rows = {k: v.detach() if k == "deformation" else v.detach()[:0] for k, v in weights.items()}
     cubes = torch.zeros(0, dtype=torch.int64, device=device)
-    assert len(extract_surface(sdf, radius=1.0, closed=closed, center=center, cubes=cubes, **rows).faces) == 0
+    none = CubeWeights(cubes=cubes, **rows)
+    assert len(extract_surface(sdf, radius=1.0, closed=closed, center=center, weights=none).faces) == 0
     weights.pop("gamma")
-    spread = vertex_deviation(sdf, radius=1.0, closed=closed, **weights)
+    spread = vertex_deviation(sdf, radius=1.0, closed=closed, weights=CubeWeights(**weights))
     assert spread.shape == (0,)
     assert all(float(g.abs().max()) == 0.0 for g in torch.autograd.grad(spread.sum(), leaves))
     assert float(sign_entropy(sdf.detach())) == 0.0

@@ -13,7 +13,7 @@ from reli3d.geometry.hull import hull_distance
 from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.regularize import vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
-from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.surface import CubeWeights, extract_surface
 from reli3d.geometry.tangents import decode_normals, encode_normals
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.kernels.flexicubes import SDF_MIN
@@ -69,7 +69,8 @@ def test_gradients_of_flexicubes(device, reach):
         "gamma": wild_weights((n,), g, reach),
     }
     ours = {k: v.to(device).requires_grad_() for k, v in leaves.items()}
-    mesh = extract_surface(ours["sdf"], radius=0.5, center=True, **{k: ours[k] for k in leaves if k != "sdf"})
+    weights = CubeWeights(**{k: ours[k] for k in leaves if k != "sdf"})
+    mesh = extract_surface(ours["sdf"], radius=0.5, center=True, weights=weights)
     cotangent = torch.randn(mesh.vertices.shape, generator=g)
     got = torch.autograd.grad((mesh.vertices * cotangent.to(device)).sum(), list(ours.values()))
     assert finite(mesh.vertices, *got)
@@ -104,7 +105,7 @@ def test_gradients_of_the_deviation(device, reach):
         wild_weights((n, 12), g, reach),
     ]
     ours = [v.to(device).requires_grad_() for v in leaves]
-    spread = vertex_deviation(ours[0], radius=0.5, **dict(zip(("deformation", "alpha", "beta"), ours[1:], strict=True)))
+    spread = vertex_deviation(ours[0], radius=0.5, weights=CubeWeights(*ours[1:]))
     assert len(spread) > N and finite(spread, *torch.autograd.grad(spread.sum(), ours))
     expected = reference_surface.flexicubes_deviation(*(v.double() for v in leaves), 1.0)
     # differences of positions in the box of 1; their absolute values have kinks, so no reference has all gradients

@@ -7,7 +7,7 @@ import torch
 
 from reli3d.geometry.mesh import report
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
-from reli3d.geometry.surface import extract_surface, surface_cubes
+from reli3d.geometry.surface import CubeWeights, extract_surface, surface_cubes
 from tests.support.reference_surface import random_weights, sphere
 
 F = torch.nn.functional
@@ -22,7 +22,7 @@ def test_deviation_of_a_flat_cut_vanishes_and_pulls_a_skewed_one_back():
     losses = []
     for _ in range(40):
         beta = beta.detach().requires_grad_()
-        loss = vertex_deviation(plane, radius=1.0, closed=False, beta=beta).mean()
+        loss = vertex_deviation(plane, radius=1.0, closed=False, weights=CubeWeights(beta=beta)).mean()
         losses.append(float(loss.detach()))
         beta = beta - 20.0 * torch.autograd.grad(loss, beta)[0]
     assert losses[-1] < 0.3 * losses[0]
@@ -36,8 +36,8 @@ def test_deviation_follows_the_vertices_of_a_closed_field_at_the_box(device):
         for name, value in random_weights((7,) * 3, 2).items()
         if name in ("alpha", "beta")
     }
-    spread = vertex_deviation(sdf, radius=1.0, cubes=cubes, **weights)
-    assert len(spread) == len(extract_surface(sdf, radius=1.0, cubes=cubes, **weights).vertices)
+    spread = vertex_deviation(sdf, radius=1.0, weights=CubeWeights(cubes=cubes, **weights))
+    assert len(spread) == len(extract_surface(sdf, radius=1.0, weights=CubeWeights(cubes=cubes, **weights)).vertices)
     (g,) = torch.autograd.grad(spread.mean(), sdf)
     assert bool(torch.isfinite(spread).all() & torch.isfinite(g).all()) and float(g.abs().max()) > 0
 
@@ -81,6 +81,10 @@ def test_entropy_removes_a_floater_that_nothing_holds():
     assert float(sdf[1, 1, 1].detach()) > 0.0
 
 
+def deviation(weights):
+    return vertex_deviation(sphere(4), radius=1.0, weights=weights)
+
+
 @pytest.mark.parametrize(
     "call, error, name",
     [
@@ -90,8 +94,8 @@ def test_entropy_removes_a_floater_that_nothing_holds():
         (lambda: sign_entropy(torch.full((3, 3, 3), float("nan"))), ValueError, "sdf"),
         (lambda: vertex_deviation(torch.ones(3, 3), radius=1.0), ValueError, "sdf"),
         (lambda: vertex_deviation(sphere(4), radius=-1.0), ValueError, "radius"),
-        (lambda: vertex_deviation(sphere(4), radius=1.0, beta=torch.zeros(64, 12)), ValueError, "beta"),
-        (lambda: vertex_deviation(sphere(4), radius=1.0, alpha=torch.ones(9, 8)), ValueError, "alpha"),
+        (lambda: deviation(CubeWeights(beta=torch.zeros(64, 12))), ValueError, "beta"),
+        (lambda: deviation(CubeWeights(alpha=torch.ones(9, 8))), ValueError, "alpha"),
     ],
 )
 def test_wrong_input_is_named(call, error, name):

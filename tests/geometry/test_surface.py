@@ -10,7 +10,7 @@ from bench.peers.flexicubes_torch import cube_list, flexicubes
 from reli3d.geometry.mesh import face_components, report, vertex_normals, volume
 from reli3d.geometry.regularize import vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
-from reli3d.geometry.surface import extract_surface, surface_cubes
+from reli3d.geometry.surface import CubeWeights, extract_surface, surface_cubes
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.geometry.uv import unwrap
 from tests.support.reference_surface import grid, random_weights, sphere, torus
@@ -32,7 +32,7 @@ def test_vertices_and_faces_are_the_published_ones_in_their_order(goldens, devic
             gamma=0.25 + 0.5 * raw[:, 20].sigmoid(),
             deformation=shift.tanh() * (1 - 1e-8) / 32,
         )
-    got = extract_surface(sdf, radius=0.5, closed=False, **weights)
+    got = extract_surface(sdf, radius=0.5, closed=False, weights=CubeWeights(**weights))
     assert np.array_equal(got.faces.cpu().numpy(), data[f"{name}.f"])
     # coordinates up to 0.53 as quotients of a few float32 terms
     np.testing.assert_allclose(got.vertices.cpu().numpy(), data[f"{name}.v"], rtol=0, atol=3e-7)
@@ -56,15 +56,13 @@ def test_mesh_of_the_published_heads(goldens):
     eight = [corner[i : i + 16, j : j + 16, k : k + 16] for k in (0, 1) for j in (0, 1) for i in (0, 1)]
     merged = 0.1 * mlp(p, "indices_merging_mlp.heads.flexicubes-weight", torch.cat(eight, -1).view(-1, 128), 3)
     np.testing.assert_allclose(merged[:64].numpy(), data["weight21_first64"], rtol=0, atol=2e-6)
-    got = extract_surface(
-        sdf,
-        radius=0.87,
-        closed=False,
+    weights = CubeWeights(
         deformation=offset.tanh() * (1 - 1e-8) / 32,
         beta=1 + 0.5 * merged[:, :12].tanh(),
         alpha=1 + 0.5 * merged[:, 12:20].tanh(),
         gamma=0.25 + 0.5 * merged[:, 20].sigmoid(),
     )
+    got = extract_surface(sdf, radius=0.87, closed=False, weights=weights)
     assert np.array_equal(got.faces.numpy(), data["faces"])
     # density is exp of a sum of 64 products: 1e-5 relative, over gradients of about 1 a cell of 0.1
     np.testing.assert_allclose(got.vertices.numpy(), data["v_pos"], rtol=0, atol=1e-5)
@@ -83,12 +81,12 @@ def test_every_sign_pattern_is_a_closed_outward_manifold_with_a_ball_for_every_c
     """Inside corners not connected by cube edges are separate components without handles: Euler number 2 each."""
     blocks = [F.pad(sign_pattern(case), (1,) * 6, value=0.5) for case in range(256)]
     sdf = torch.cat([torch.cat(blocks[16 * k : 16 * k + 16], 0) for k in range(16)], 1).to(device)
-    found = report(extract_surface(sdf, radius=1.0, **random_weights(sdf.shape, 0, device)))
+    found = report(extract_surface(sdf, radius=1.0, weights=CubeWeights(**random_weights(sdf.shape, 0, device))))
     assert found.watertight and found.manifold and found.degenerate_faces == 0, found
     parts = sum(ndimage.label(block.numpy() < 0)[1] for block in blocks)
     assert (found.components, found.euler) == (parts, 2 * parts)
     # weights beyond the range of the published activations may fold a thin part over; within it none does
-    mesh = extract_surface(sdf, radius=1.0, **random_weights(sdf.shape, 0, device, spread=0.5))
+    mesh = extract_surface(sdf, radius=1.0, weights=CubeWeights(**random_weights(sdf.shape, 0, device, spread=0.5)))
     label = face_components(mesh)
     a, b, c = (mesh.vertices[mesh.faces[:, k].long()].double() for k in range(3))
     volumes = torch.zeros(int(label.max()) + 1, device=device, dtype=torch.float64)
@@ -113,7 +111,7 @@ def test_one_inside_vertex_has_the_eight_dual_vertices_of_the_closed_form(device
 @pytest.mark.parametrize("case", range(1, 255, 11))
 def test_one_cube_is_closed_at_the_box(device, case):
     sdf = sign_pattern(case).contiguous().to(device)
-    mesh = extract_surface(sdf, radius=1.0, **random_weights(sdf.shape, case, device))
+    mesh = extract_surface(sdf, radius=1.0, weights=CubeWeights(**random_weights(sdf.shape, case, device)))
     found = report(mesh)
     assert found.watertight and found.manifold, found
     assert float(volume(mesh)) > 0
@@ -124,7 +122,7 @@ def test_noise_is_a_closed_manifold_with_the_inside_on_the_inner_side(device, se
     rng = torch.Generator().manual_seed(seed)
     sdf = torch.randn(9, 10, 12, generator=rng).to(device)  # all ambiguous cases, faces at the box too
     sdf[sdf.abs() < 0.05] = 0.0
-    mesh = extract_surface(sdf, radius=(0.5, 1.0, 2.0), **random_weights(sdf.shape, seed, device))
+    mesh = extract_surface(sdf, radius=(0.5, 1.0, 2.0), weights=CubeWeights(**random_weights(sdf.shape, seed, device)))
     found = report(mesh)
     assert found.watertight and found.manifold, found
     half = torch.tensor([0.5, 1.0, 2.0], device=device)
@@ -155,7 +153,7 @@ def test_a_half_space_is_closed_flat_at_the_box(device):
 def test_the_peer_that_is_timed_gives_the_same_surface():
     sdf = F.pad(torch.randn(9, 8, 10, generator=torch.Generator().manual_seed(8)), (1,) * 6, value=0.7)
     weights = random_weights(sdf.shape, 2, spread=0.5)
-    mesh = extract_surface(sdf, radius=0.8, **weights)
+    mesh = extract_surface(sdf, radius=0.8, weights=CubeWeights(**weights))
     vertices, faces = flexicubes(
         sdf, *(weights[k] for k in ("deformation", "alpha", "beta", "gamma")), cube_list(sdf.shape), 1.6
     )
@@ -172,18 +170,18 @@ def test_the_peer_that_is_timed_gives_the_same_surface():
 def test_weights_of_surface_cubes_only(device):
     for sdf in (sphere(10, device=device), grid(10, device=device)[..., 2] + 0.03):
         weights = random_weights(sdf.shape, 0, device)
-        dense = extract_surface(sdf, radius=1.0, **weights)
+        dense = extract_surface(sdf, radius=1.0, weights=CubeWeights(**weights))
         cubes = surface_cubes(sdf)
         rows = {k: v if k == "deformation" else v[cubes].requires_grad_() for k, v in weights.items()}
-        got = extract_surface(sdf, radius=1.0, cubes=cubes, **rows)
+        got = extract_surface(sdf, radius=1.0, weights=CubeWeights(cubes=cubes, **rows))
         assert torch.equal(got.vertices, dense.vertices) and torch.equal(got.faces, dense.faces)
         g_alpha, g_beta = torch.autograd.grad(got.vertices.square().sum(), (rows["alpha"], rows["beta"]))
         full = {k: v.clone().requires_grad_() for k, v in weights.items()}
-        again = extract_surface(sdf, radius=1.0, **full)
+        again = extract_surface(sdf, radius=1.0, weights=CubeWeights(**full))
         f_alpha, f_beta = torch.autograd.grad(again.vertices.square().sum(), (full["alpha"], full["beta"]))
         assert torch.equal(g_alpha, f_alpha[cubes]) and torch.equal(g_beta, f_beta[cubes])
         with pytest.raises(ValueError, match="cubes"):
-            extract_surface(sdf, radius=1.0, cubes=cubes.flip(0), **rows)
+            extract_surface(sdf, radius=1.0, weights=CubeWeights(cubes=cubes.flip(0), **rows))
 
 
 @pytest.mark.parametrize(
@@ -211,7 +209,8 @@ def test_weights_of_surface_cubes_only(device):
 def test_wrong_input_is_named(change, error, name):
     arguments = dict(sdf=sphere(4), radius=1.0) | change
     with pytest.raises(error, match=name):
-        extract_surface(arguments.pop("sdf"), **arguments)
+        sdf, radius = arguments.pop("sdf"), arguments.pop("radius")
+        extract_surface(sdf, radius=radius, weights=CubeWeights(**arguments))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -224,7 +223,7 @@ def test_fields_and_weights_of_any_size_give_finite_vertices_and_gradients(devic
     cubes = 11 * 10 * 9
     alpha, beta = (10.0 ** torch.randint(-3, 4, (cubes, n), generator=rng) for n in (8, 12))
     leaves = [v.to(device).requires_grad_() for v in (sdf, alpha, beta)]
-    mesh = extract_surface(leaves[0], radius=1.0, alpha=leaves[1], beta=leaves[2])
+    mesh = extract_surface(leaves[0], radius=1.0, weights=CubeWeights(alpha=leaves[1], beta=leaves[2]))
     found = report(mesh.detach())
     assert found.boundary_edges == 0 and float(mesh.vertices.detach().abs().max()) <= 1.0 + 1e-6  # rounding of a mean
     grads = torch.autograd.grad(mesh.vertices.sum(), leaves)
@@ -240,9 +239,11 @@ def test_gradients_behind_the_mesh_are_bitwise_identical_for_any_number_of_threa
         threads(count)
         leaves = {k: v.clone().requires_grad_() for k, v in weights.items()}
         given = {k: v for k, v in leaves.items() if k not in ("sdf", "gamma")}
-        mesh = extract_surface(leaves["sdf"], radius=1.0, center=True, gamma=leaves["gamma"], **given)
+        mesh = extract_surface(
+            leaves["sdf"], radius=1.0, center=True, weights=CubeWeights(gamma=leaves["gamma"], **given)
+        )
         shown = unwrap(taubin_smooth(mesh.with_normals(), iterations=2), texture_size=64)
-        spread = vertex_deviation(leaves["sdf"], radius=1.0, **given)
+        spread = vertex_deviation(leaves["sdf"], radius=1.0, weights=CubeWeights(**given))
         seen = [mesh.vertices, shown.vertices, shown.normals, spread]
         rng = torch.Generator().manual_seed(1)
         cotangent = [torch.randn(v.shape, generator=rng) for v in seen]
@@ -255,11 +256,11 @@ def test_gradients_in_the_padding_reach_their_vertices(device):
     sdf = grid(5, device=device)[..., 0] + 0.1
     leaf = sdf.clone().requires_grad_()
     shift = torch.zeros(6, 6, 6, 3, device=device).requires_grad_()
-    mesh = extract_surface(leaf, radius=1.0, deformation=shift)
+    mesh = extract_surface(leaf, radius=1.0, weights=CubeWeights(shift))
     g_sdf, g_shift = torch.autograd.grad(mesh.vertices.square().sum(), (leaf, shift))
     assert bool(torch.isfinite(g_sdf).all()) and bool(torch.isfinite(g_shift).all())
     # the total weight of a vertex is one: moving the whole grid moves every vertex
-    (whole,) = torch.autograd.grad(extract_surface(leaf, radius=1.0, deformation=shift).vertices.sum(), shift)
+    (whole,) = torch.autograd.grad(extract_surface(leaf, radius=1.0, weights=CubeWeights(shift)).vertices.sum(), shift)
     torch.testing.assert_close(whole.sum((0, 1, 2)), torch.full((3,), 2.0 * len(mesh.vertices), device=device))
 
 
@@ -267,8 +268,8 @@ def test_center_vertices_split_quads_in_four(device):
     sdf = torus(12, device)
     weights = random_weights(sdf.shape, 2, device)
     weights["gamma"].requires_grad_()
-    two = extract_surface(sdf, radius=1.0, **weights)
-    four = extract_surface(sdf, radius=1.0, center=True, **weights)
+    two = extract_surface(sdf, radius=1.0, weights=CubeWeights(**weights))
+    four = extract_surface(sdf, radius=1.0, center=True, weights=CubeWeights(**weights))
     quads = len(two.faces) // 2
     assert len(four.faces) == 4 * quads and len(four.vertices) == len(two.vertices) + quads
     found = report(four.detach())

@@ -11,7 +11,7 @@ import torch
 from reli3d import pipeline
 from reli3d.cli import infer
 from reli3d.geometry.mesh import report
-from reli3d.geometry.surface import extract_surface, surface_cubes
+from reli3d.geometry.surface import CubeWeights, extract_surface, surface_cubes
 from reli3d.nn import field
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
@@ -46,7 +46,7 @@ def test_weights_evaluated_near_the_surface_give_the_published_mesh(goldens):
     flat = pipeline._grid(16, 0.87, torch.device("cpu")).reshape(-1, 3)
     sdf = model.sdf(model.query(code, flat[None], ("density",))["density"])[0, :, 0].view(17, 17, 17)
     weights = field.TriplaneField(None, model, code).cube_weights(flat, sdf)
-    got = extract_surface(sdf, radius=0.87, closed=False, **weights)
+    got = extract_surface(sdf, radius=0.87, closed=False, weights=weights)
     assert np.array_equal(got.faces.numpy(), data["faces"])
     # density is exp of a sum of 64 products: 1e-5 relative, over gradients of about 1 a cell of 0.1
     np.testing.assert_allclose(got.vertices.numpy(), data["v_pos"], rtol=0, atol=1e-5)
@@ -65,17 +65,11 @@ def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
     corner = raw["flexicubes"][0].view(13, 13, 13, 16)
     eight = [corner[i : i + n, j : j + n, k : k + n] for k in (0, 1) for j in (0, 1) for i in (0, 1)]
     dense = tiny.merger(torch.stack(eight, -2).view(n**3, 8, 16))
-    expected = extract_surface(
-        sdf,
-        radius=0.87,
-        deformation=deformation(raw["deformation"][0], n).view(13, 13, 13, 3),
-        alpha=dense.alpha,
-        beta=dense.beta,
-        gamma=dense.gamma,
-    )
+    shift = deformation(raw["deformation"][0], n).view(13, 13, 13, 3)
+    expected = extract_surface(sdf, radius=0.87, weights=CubeWeights(shift, dense.alpha, dense.beta, dense.gamma))
     weights = field.TriplaneField(None, tiny, code).cube_weights(flat, sdf)
-    assert len(weights["alpha"]) == len(surface_cubes(sdf))
-    got = extract_surface(sdf, radius=0.87, **weights)
+    assert len(weights.alpha) == len(surface_cubes(sdf))
+    got = extract_surface(sdf, radius=0.87, weights=weights)
     assert torch.equal(got.faces, expected.faces)
     # products of other shapes sum in another order: a few units in the last place of 0.87
     torch.testing.assert_close(got.vertices, expected.vertices, rtol=0, atol=2e-6)

@@ -21,7 +21,7 @@ from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
-from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.surface import CubeWeights, extract_surface
 from reli3d.geometry.tangents import decode_normals, encode_normals
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.render import color, gbuffer, material, sampling
@@ -196,12 +196,13 @@ def grid_inputs(_, shape=(7, 6, 8), seed: int = 3) -> dict[str, Tensor]:
 
 
 def surface(sdf, deformation, alpha, beta, gamma):
-    mesh = extract_surface(sdf, radius=0.8, deformation=deformation, alpha=alpha, beta=beta, gamma=gamma, center=True)
+    weights = CubeWeights(deformation, alpha, beta, gamma)
+    mesh = extract_surface(sdf, radius=0.8, weights=weights, center=True)
     return mesh.vertices, mesh.faces
 
 
 def deviation(sdf, deformation, alpha, beta):
-    return (vertex_deviation(sdf, radius=0.8, deformation=deformation, alpha=alpha, beta=beta),)
+    return (vertex_deviation(sdf, radius=0.8, weights=CubeWeights(deformation, alpha, beta)),)
 
 
 def points_of(vertices, normals, uv, base_color, roughness, metallic, normal, bary):

@@ -14,7 +14,7 @@ from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
-from reli3d.geometry.surface import extract_surface, surface_cubes, surface_points
+from reli3d.geometry.surface import CubeWeights, extract_surface, surface_cubes, surface_points
 from reli3d.nn.field import MATERIAL
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
@@ -78,11 +78,11 @@ def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None
     sdf = free.reshape(-1).index_copy(0, at, known).view_as(free)
     offset = torch.zeros_like(points).index_copy(0, at, deformation(raw["deformation"], resolution))
     merged = model.merger(raw["flexicubes"].index_select(0, rows.reshape(-1)).view(len(cubes), 8, -1))
-    weights = {"deformation": offset.view(*sdf.shape, 3), "alpha": merged.alpha, "beta": merged.beta}
-    made = extract_surface(sdf, radius=radius, gamma=merged.gamma, cubes=cubes, center=True, **weights)
+    weights = CubeWeights(offset.view(*sdf.shape, 3), merged.alpha, merged.beta, merged.gamma, cubes)
+    made = extract_surface(sdf, radius=radius, weights=weights, center=True)
     mesh = Mesh(made.vertices, made.faces, vertex_normals(made.vertices, made.faces))
     terms = {
-        "deviation": vertex_deviation(sdf, radius=radius, cubes=cubes, **weights).mean(),
+        "deviation": vertex_deviation(sdf, radius=radius, weights=weights).mean(),
         "sign": sign_entropy(sdf),
         "spread": torch.cat([merged.alpha, merged.beta], -1).sub(1.0).abs().mean(),
     }
