@@ -216,9 +216,9 @@ def draw_rig(views: Views, path: str | os.PathLike) -> None:
     size = (2 * PANEL + 3 * MARGIN, PANEL + 2 * MARGIN + rows * (THUMB + 18 + MARGIN))
     canvas = Image.new("RGB", size, "white")
     titles = ("from above: x right, z down", "from the front: x right, y up")
-    for panel, (title, across, down) in enumerate(zip(titles, (0, 0), ((2, 1.0), (1, -1.0)))):
+    for panel, (title, down) in enumerate(zip(titles, ((2, 1.0), (1, -1.0)))):
         corner = (MARGIN + panel * (PANEL + MARGIN), MARGIN)
-        canvas.paste(_panel(views, hull, middle, reach, frustums, title, across, *down), corner)
+        canvas.paste(_panel(views, hull, middle, reach, frustums, title, down), corner)
     for i in range(len(views)):
         at = (MARGIN + i % columns * (THUMB + MARGIN), PANEL + 2 * MARGIN + i // columns * (THUMB + 18 + MARGIN))
         canvas.paste(_thumbnail(views, hull, i), at)
@@ -247,18 +247,20 @@ def _cube(views: Views) -> np.ndarray:
     return normalize(views).inverse().apply(corners).numpy()
 
 
-def _panel(views, hull, middle, reach, frustums, title, across, down, sign) -> Image.Image:
+def _panel(views, hull, middle, reach, frustums, title, vertical) -> Image.Image:
+    """The rig with x to the right.  vertical: world axis along the image's rows, and its sign downwards."""
+    down, sign = vertical
     bitmap = Image.new("RGB", (PANEL, PANEL), "#f4f4f4")
     draw = ImageDraw.Draw(bitmap)
     zoom = 0.5 * PANEL / reach
 
     def at(points) -> list[tuple[float, float]]:
         p = (np.asarray(points, dtype=np.float64).reshape(-1, 3) - middle) * zoom
-        return [(PANEL / 2 + a, PANEL / 2 + sign * b) for a, b in zip(p[:, across], p[:, down])]
+        return [(PANEL / 2 + a, PANEL / 2 + sign * b) for a, b in zip(p[:, 0], p[:, down])]
 
     if len(hull.points):
         points = hull.points.numpy()
-        order = np.argsort(points[:, 3 - across - down])  # seen from the positive end of the third axis
+        order = np.argsort(points[:, 3 - down])  # seen from the positive end of the third axis
         shade = np.linspace(90, 190, len(order)).astype(int)[::-1]
         half = max(1.0, 0.5 * hull.cell * zoom)
         for (x, y), gray in zip(at(points[order]), shade):
