@@ -50,7 +50,6 @@ def parser() -> argparse.ArgumentParser:
         help="number of frames of a full turn about +Y (default 1; 72 if --output is an animation)",
     )
     p.add_argument("--turn", choices=("camera", "light"), default="camera", help="rotate the camera or the environment")
-    p.add_argument("--rotate-light", dest="turn", action="store_const", const="light", help="same as --turn light")
     p.add_argument("--azimuth", type=float, default=30.0, help="azimuth of the first view in degrees, from +Z to +X")
     p.add_argument("--elevation", type=float, default=20.0, help="camera elevation in degrees, -89 to 89")
     p.add_argument("--fov", type=float, default=32.0, help="horizontal field of view in degrees")

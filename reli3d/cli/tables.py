@@ -20,10 +20,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--weights", default="small", help="small, or a safetensors file")
     p.add_argument("--views", type=int, nargs="+", default=(1, 2, 4, 8, 16), help="numbers of input views")
     p.add_argument("--size", type=int, default=128, help="pixels per side of a view")
-    p.add_argument("--hero", choices=("random", "first"), default="random", help="which view is the reference view")
-    p.add_argument(
-        "--icp", action="store_true", help="align the result to the reference by ICP before comparing geometry"
-    )
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--output", type=Path, default=Path("tables"), help="folder of table.md, objects.csv and sheet.png")
     return p
@@ -32,7 +28,7 @@ def parser() -> argparse.ArgumentParser:
 @command("reli3d-tables")
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
-    from reli3d.eval.objects import TableOptions, as_csv, markdown, table
+    from reli3d.eval.objects import as_csv, markdown, table
     from reli3d.io.files import file_size, write_bytes
     from reli3d.io.images import write_png
     from reli3d.nn.weights import load_model
@@ -52,9 +48,10 @@ def main(argv: list[str] | None = None) -> int:
     if len(lights) < 2:
         raise InputError("--maps", "expected at least two held-out maps, got fewer; give twelve maps or more")
     model = load_model(args.weights)
-    options = TableOptions(args.size, args.hero, args.icp, args.seed)
     report = lambda line: print(line, file=sys.stderr)  # noqa: E731
-    tables, rows, sheet = table(model, args.objects, lights, args.views, options, report)
+    tables, rows, sheet = table(
+        model, args.objects, lights, args.views, size=args.size, seed=args.seed, progress=report
+    )
     args.output.mkdir(parents=True, exist_ok=True)
     text = markdown(tables)
     write_bytes(args.output / "table.md", text.encode())

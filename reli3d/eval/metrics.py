@@ -6,7 +6,6 @@ display values (sRGB in [0, 1]) over black, including the background.
 
 import numpy as np
 import torch
-import trimesh
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import conv2d
@@ -31,17 +30,15 @@ def surface_samples(mesh: Mesh, count: int = SURFACE_SAMPLES, seed: int = 0) -> 
     return (1 - u) * a + u * (1 - v) * b + u * v * c
 
 
-def geometry(result: np.ndarray, reference: np.ndarray, *, icp: bool = False) -> dict[str, float]:
+def geometry(result: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Chamfer distance and F-scores of points ``(N, 3)`` of a result and of the reference.
 
     cd: mean of the two mean distances (not squared) to the nearest point of the other set.  fs@t: harmonic mean of
     precision and recall, the fractions of points within t of the other set.  Lengths are in units of half the longest
-    side of the reference.  icp: first align the result by a rigid motion (Besl and McKay 1992, from the identity).
+    side of the reference.
     """
     half = float(np.ptp(reference, axis=0).max()) / 2.0
     result, reference = result / half, reference / half
-    if icp:
-        _, result, _ = trimesh.registration.icp(result, reference, max_iterations=50, reflection=False, scale=False)
     to_reference, to_result = cKDTree(reference).query(result)[0], cKDTree(result).query(reference)[0]
     found = {"cd": float(to_reference.mean() + to_result.mean()) / 2.0}
     for t in THRESHOLDS:

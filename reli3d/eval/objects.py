@@ -43,16 +43,6 @@ COLUMNS = {  # the paper's groups
 
 
 @dataclass(frozen=True)
-class TableOptions:
-    """Options of :func:`table`."""
-
-    size: int = 128  # pixels per side of the views
-    hero: str = "random"  # how the reference view is chosen, ``random`` or ``first``
-    icp: bool = False  # align the result to the reference before comparing geometry
-    seed: int = 0  # of the first object; the next has the next seed
-
-
-@dataclass(frozen=True)
 class ReferenceObject:
     """The original object with its lighting and cameras."""
 
@@ -131,15 +121,15 @@ def input_views(target: ReferenceObject, count: int, hero: int, exposure: float)
 
 @torch.no_grad()
 def evaluate(
-    model: Network, target: ReferenceObject, count: int, *, hero: str = "random", icp: bool = False, seed: int = 0
+    model: Network, target: ReferenceObject, count: int, *, seed: int = 0
 ) -> tuple[dict[str, float], list[Tensor]]:
     """Metrics of one object reconstructed from ``count`` views, and a row of images for :func:`sheet`.
 
-    hero: how the reference view is chosen, ``random`` or ``first``.  ``empty``: 1 if the network predicts no surface;
-    the images are then black and the geometry metrics absent.
+    The reference view is random.  ``empty``: 1 if the network predicts no surface; the images are then black and the
+    geometry metrics absent.
     """
     exposures = exposure_of(target, target.light), exposure_of(target, target.other)
-    front = int(np.random.default_rng((seed, count)).integers(count)) if hero == "random" else 0
+    front = int(np.random.default_rng((seed, count)).integers(count))
     views = input_views(target, count, front, exposures[0])
     unseen = target.cameras[-HELD_OUT_VIEWS:]
     reference = [layers(target.parts, c, target.light, target.other, exposures) for c in unseen]
@@ -153,7 +143,7 @@ def evaluate(
         light = present("environment", asset.environment)
         result = [layers(asset, c, light, target.other, (1.0, exposures[1])) for c in unseen]
         mesh = joined([p.mesh for p in target.parts])
-        found |= geometry(surface_samples(asset.mesh), surface_samples(mesh, seed=1), icp=icp)
+        found |= geometry(surface_samples(asset.mesh), surface_samples(mesh, seed=1))
     for name in ("image", "relit", *MAPS):
         found[f"{name}_psnr"] = float(np.mean([psnr(g[name], w[name]) for g, w in zip(result, reference, strict=True)]))
         found[f"{name}_ssim"] = float(np.mean([ssim(g[name], w[name]) for g, w in zip(result, reference, strict=True)]))
@@ -205,21 +195,23 @@ def table(
     files: Sequence[Path],
     lights: Sequence[Environment],
     counts: Sequence[int],
-    options: TableOptions,
+    *,
+    size: int = 128,
+    seed: int = 0,
     progress: Callable[[str], None] = lambda line: None,
 ) -> tuple[dict, list[dict], Tensor]:
     """Means for each number of views, the metrics of every object, and the image sheet of the last number of views.
 
-    lights: assigned to the objects in turn; the next one is used for relighting.
+    lights: assigned to the objects in turn; the next one is used for relighting.  size: pixels per side of the views.
+    seed: of the first object; the next has the next seed.
     """
     rows: list[dict] = []
     rows_of_images = []
     for k, path in enumerate(files):
         light, other = lights[k % len(lights)], lights[(k + 1) % len(lights)]
-        seed = options.seed + k
-        target = load_reference(path, light, other, inputs=max(counts), size=options.size, seed=seed)
+        target = load_reference(path, light, other, inputs=max(counts), size=size, seed=seed + k)
         for count in counts:
-            found, shown = evaluate(model, target, count, hero=options.hero, icp=options.icp, seed=seed)
+            found, shown = evaluate(model, target, count, seed=seed + k)
             rows.append({"object": target.name, "views": count, **found})
             progress(f"{target.name}, {count} views: " + ", ".join(f"{n} {v:.3f}" for n, v in found.items()))
         rows_of_images.append(shown)

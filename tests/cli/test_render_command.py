@@ -184,7 +184,7 @@ def test_the_name_of_the_output_makes_an_animation(scene, tmp_path, ending):
         av = pytest.importorskip("av")
     path = tmp_path / f"turn.{ending}"
     places = [str(scene / "ball.glb"), "--light", str(scene / "half.hdr"), "--output", str(path)]
-    options = ["--size", "48", "--frames", "4", "--rotate-light", "--quality", "draft", "--json"]
+    options = ["--size", "48", "--frames", "4", "--turn", "light", "--quality", "draft", "--json"]
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
         assert main(places + options) == 0

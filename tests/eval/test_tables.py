@@ -1,7 +1,6 @@
 """The paper's figures against closed forms, and its tables on a ball."""
 
 import inspect
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -31,13 +30,6 @@ def test_chamfer_and_f_score_of_two_spheres():
     assert found["fs@0.1"] == 0.0 and found["fs@0.2"] == 1.0 and found["fs@0.5"] == 1.0
     scaled = geometry(7.0 * sphere(1.15), 7.0 * sphere(1.0, seed=1))
     assert scaled["cd"] == pytest.approx(found["cd"], rel=1e-9)
-
-
-def test_icp_takes_a_small_turn_and_shift_back():
-    expected = sphere(1.0, 4000) * np.array([1.0, 0.5, 0.3])
-    c, s = math.cos(0.1), math.sin(0.1)
-    got = expected @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + 0.05
-    assert geometry(got, expected)["cd"] > 0.02 and geometry(got, expected, icp=True)["cd"] < 2e-3
 
 
 def test_surface_samples_lie_on_the_surface_evenly():
