@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from reli3d.geometry.surface import CubeWeights
 from reli3d.geometry.triplane import sample_triplane
 
 ROUGHNESS_MIN = 0.1  # range [0.1, 1] of the published head
@@ -110,16 +111,6 @@ def truncated_exp(x: Tensor) -> Tensor:
     return _TruncatedExp.apply(x)
 
 
-@dataclass(frozen=True)
-class CubeWeights:
-    """FlexiCubes weights of cubes (Shen et al. 2023, arXiv 2308.05371): beta in (0.5, 1.5), alpha likewise, gamma in
-    (0.25, 0.75)."""
-
-    beta: Tensor  # (..., 12) of the edges
-    alpha: Tensor  # (..., 8) of the corners
-    gamma: Tensor  # (...) of the cube
-
-
 class WeightMerger(nn.Module):
     """MLP from the eight corner vectors of a cube to its FlexiCubes weights."""
 
@@ -135,12 +126,15 @@ class WeightMerger(nn.Module):
         return MERGED_MULTIPLIER * self.mlp(corners.flatten(-2))
 
     def forward(self, corners: Tensor) -> CubeWeights:
-        """Weights of cubes whose corners have the ``flexicubes`` head's values ``(..., 8, 16)``."""
+        """Weights of cubes whose corners have the ``flexicubes`` head's values ``(..., 8, 16)``.
+
+        alpha and beta are in (0.5, 1.5), gamma in (0.25, 0.75).
+        """
         beta, alpha, gamma = self.merged(corners).split((12, 8, 1), dim=-1)
         return CubeWeights(
-            1.0 + WEIGHT_SCALE * beta.tanh(),
-            1.0 + WEIGHT_SCALE * alpha.tanh(),
-            (0.25 + WEIGHT_SCALE * gamma.sigmoid()).squeeze(-1),
+            alpha=1.0 + WEIGHT_SCALE * alpha.tanh(),
+            beta=1.0 + WEIGHT_SCALE * beta.tanh(),
+            gamma=(0.25 + WEIGHT_SCALE * gamma.sigmoid()).squeeze(-1),
         )
 
 

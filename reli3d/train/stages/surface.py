@@ -1,7 +1,7 @@
 """Differentiable extraction and rendering of the predicted surface, for all stages but ``volume``."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
-from reli3d.geometry.surface import CubeWeights, extract_surface, surface_cubes, surface_points
+from reli3d.geometry.surface import extract_surface, surface_cubes, surface_points
 from reli3d.nn.field import MATERIAL
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
@@ -78,13 +78,13 @@ def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None
     sdf = free.reshape(-1).index_copy(0, at, known).view_as(free)
     offset = torch.zeros_like(points).index_copy(0, at, deformation(raw["deformation"], resolution))
     merged = model.merger(raw["flexicubes"].index_select(0, rows.reshape(-1)).view(len(cubes), 8, -1))
-    weights = CubeWeights(offset.view(*sdf.shape, 3), merged.alpha, merged.beta, merged.gamma, cubes)
+    weights = replace(merged, deformation=offset.view(*sdf.shape, 3), cubes=cubes)
     made = extract_surface(sdf, radius=radius, weights=weights, center=True)
     mesh = Mesh(made.vertices, made.faces, vertex_normals(made.vertices, made.faces))
     terms = {
         "deviation": vertex_deviation(sdf, radius=radius, weights=weights).mean(),
         "sign": sign_entropy(sdf),
-        "spread": torch.cat([merged.alpha, merged.beta], -1).sub(1.0).abs().mean(),
+        "spread": torch.cat([present("alpha", merged.alpha), present("beta", merged.beta)], -1).sub(1.0).abs().mean(),
     }
     scene = RayScene(mesh.vertices.detach(), mesh.faces)
     return Surface(mesh, scene, mesh_edges(mesh.vertices.detach(), mesh.faces), terms)
