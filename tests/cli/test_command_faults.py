@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -142,9 +143,8 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_result(tmp_path):
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_while_the_interpreter_ends_is_one_line_too(tmp_path, number, code):
     """After the path is printed the process waits for a thread, then for functions registered at exit."""
-    codes = []
-    for k in range(6):
-        process = start(["--output", tmp_path / "out"], body=ENDS_LATE)
+
+    def end(k, process):
         assert process.stdout.readline().endswith("mesh.glb\n")
         printed = time.monotonic()
         time.sleep(0.15 * k)
@@ -154,9 +154,12 @@ def test_a_signal_while_the_interpreter_ends_is_one_line_too(tmp_path, number, c
         found = (process.returncode, len(lines_of(err)))
         assert found == (code, 1) or (not early and found == (0, 0)), (k, found, err)
         assert "Traceback" not in err and "Exception" not in err
-        codes.append(process.returncode)
-    assert code in codes
-    assert (tmp_path / "out/example/mesh.glb").read_text() == "mesh"
+        assert (tmp_path / f"out{k}/example/mesh.glb").read_text() == "mesh"
+        return process.returncode
+
+    processes = [start(["--output", tmp_path / f"out{k}"], body=ENDS_LATE) for k in range(6)]
+    with ThreadPoolExecutor(len(processes)) as pool:
+        assert code in list(pool.map(end, range(6), processes))
 
 
 @pytest.mark.parametrize("fails, code", [("", 0), ("; 1 / 0", 1)])
