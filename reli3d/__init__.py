@@ -17,7 +17,7 @@ _MODULES = {
     "geometry.mesh": ("Mesh",),
     "geometry.rays": ("RayScene",),
     "geometry.hits": ("Hits",),
-    "geometry.surface": ("extract_surface",),
+    "geometry.surface": ("CubeWeights", "extract_surface"),
     "geometry.triplane": ("sample_triplane",),
     "geometry.uv": ("unwrap",),
     "geometry.bake": ("bake",),

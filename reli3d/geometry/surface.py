@@ -25,7 +25,11 @@ from reli3d.kernels.flexicubes_tables import tables
 
 @dataclass(frozen=True)
 class CubeWeights:
-    """FlexiCubes' parameters of a grid, float32; None: no offsets, or weights of 1."""
+    """FlexiCubes' parameters of a grid, float32; None: no offsets, or weights of 1.
+
+    >>> sdf = torch.rand(5, 5, 5) - 0.5
+    >>> mesh = reli3d.extract_surface(sdf, radius=1.0, weights=reli3d.CubeWeights(beta=torch.ones(64, 12)))
+    """
 
     deformation: Tensor | None = None  # (X + 1, Y + 1, Z + 1, 3) offsets of the grid vertices, fractions of the box
     alpha: Tensor | None = None  # (K, 8) positive weights of corners

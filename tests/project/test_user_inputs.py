@@ -11,7 +11,7 @@ from reli3d.geometry.bake import bake
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
-from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.surface import CubeWeights, extract_surface
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
@@ -56,7 +56,8 @@ def test_what_would_lose_digits_is_refused():
 def test_a_grid_from_numpy_gives_the_same_surface():
     sdf = np.random.default_rng(0).normal(size=(5, 6, 7)).astype(np.float32)
     alpha = np.ones((4 * 5 * 6, 8), np.float32)
-    a, b = extract_surface(sdf, radius=1.0, alpha=alpha), extract_surface(torch.from_numpy(sdf), radius=1.0)
+    a = extract_surface(sdf, radius=1.0, weights=CubeWeights(alpha=alpha))
+    b = extract_surface(torch.from_numpy(sdf), radius=1.0)
     assert torch.equal(a.vertices, b.vertices) and torch.equal(a.faces, b.faces)
 
 
