@@ -46,6 +46,9 @@ LIGHT_ROWS = 16  # rows of the map whose irradiance the material heads read
 TOKEN_EXTRA = 4  # depth and world normal, appended to the pyramid's features
 QUARTER = 4  # pixels of a view per side of a pixel whose ray is intersected with the hull
 FUSED_WIDTH = 10  # width of Fused.numbers
+VIEW_WEIGHT = (
+    7  # of its columns: greatest blend weight of a view: about 0 where none shows the point, 1 where one faces it
+)
 HEAD_OUTPUTS = 13  # width of LocalField.heads
 NORMAL_RIGHT = -OTHERS_AFTER  # of the pyramid's predictions: changes its sign under a left-right flip of the image
 METALLIC_LOGIT = -2.0  # where the prediction is zero
