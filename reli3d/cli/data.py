@@ -1,4 +1,4 @@
-"""``reli3d-data``: renders training samples of procedural objects or meshes."""
+"""``reli3d-data``: renders training samples of procedural objects or meshes, and packs objects into shards."""
 
 import argparse
 import contextlib
@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from reli3d.cli import objects
-from reli3d.cli.exit_codes import Parser, check_ranges, command
+from reli3d.cli.exit_codes import Parser, check_ranges, command, report
 from reli3d.cli.samples import SampleJob, SampleSpec
 from reli3d.errors import InputError
 
@@ -16,7 +16,7 @@ COUNT, VIEWS = 1000, 6  # default numbers of seeds and views
 
 
 def parser() -> argparse.ArgumentParser:
-    whole = Parser(prog="reli3d-data", description="Render training samples.")
+    whole = Parser(prog="reli3d-data", description="Render training samples, and pack objects into shards.")
     actions = whole.add_subparsers(dest="action", required=True, metavar="ACTION")
     about = "render training samples of procedural objects or textured meshes"
     p = actions.add_parser("render", help=about, description=f"{about.capitalize()}.")
@@ -62,6 +62,13 @@ def parser() -> argparse.ArgumentParser:
     where = p.add_mutually_exclusive_group()
     where.add_argument("--workers", type=int, help="number of processes; default one per core")
     where.add_argument("--ray", metavar="ADDRESS", help="render on a Ray cluster: auto, local, or its address")
+    p.set_defaults(run=render)
+    about = "write samples or captures as WebDataset tar files"
+    p = actions.add_parser("pack", help=about, description=f"{about.capitalize()}; existing files are kept.")
+    p.add_argument("input", type=Path, help="folder of samples, or of captures with transforms.json each")
+    p.add_argument("output", type=Path, help="folder for NNNNNN.tar")
+    p.add_argument("--each", type=int, default=64, help="objects per tar file")
+    p.set_defaults(run=pack)
     return whole
 
 
@@ -111,6 +118,11 @@ def _sample_spec(args: argparse.Namespace) -> SampleSpec:
 @command("reli3d-data")
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
+    return args.run(args)
+
+
+def render(args: argparse.Namespace) -> int:
+    """Writes the samples; returns 1 if some objects failed."""
     spec = _sample_spec(args)
     from tqdm import tqdm
 
@@ -141,6 +153,26 @@ def main(argv: list[str] | None = None) -> int:
             lost += 1
             tqdm.write(f"{row.object}: {notes}", file=sys.stderr)
     return 1 if lost else 0
+
+
+def pack(args: argparse.Namespace) -> int:
+    """Writes the tar files and reports captures that are left out."""
+    from reli3d.output.folder import check_folder
+    from reli3d.train.stages import shards
+    from reli3d.train.stages.captures import Captures
+    from reli3d.train.stages.sources import source
+    from reli3d.train.stages.views import Samples
+
+    check_ranges(args, each=(1, 10**6))
+    check_folder(args.output)
+    found = source(args.input)
+    if not isinstance(found, Samples | Captures):
+        raise InputError(args.input, "expected samples or captures, got tar files")
+    if isinstance(found, Captures):
+        for name, reason in found.rejected.items():
+            report(f"{name}: left out, {reason}")
+    shards.pack(found, args.output, each=args.each, progress=report)
+    return 0
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         nargs="*",
         default=[],
-        help="folders of samples; for the stages of the ReLi3D paper also captures; for light_prior "
+        help="folders of samples; for the stages of the ReLi3D paper also captures, shards; for light_prior "
         "environment maps, .npz",
     )
     p.add_argument("output", type=Path, help="folder of the checkpoint, the log and validation images")
@@ -221,7 +221,7 @@ def paper_stage(args: argparse.Namespace) -> "Stage":
         known = ", ".join((*SMALL_STAGES, LIGHT_PRIOR, *stages))
         raise InputError("--stage", f"expected {known} for preset {preset.name}, got {args.stage}")
     if not args.data and "export" not in args:
-        raise InputError("data", "expected folders of samples or captures, got none")
+        raise InputError("data", "expected folders of samples, captures or shards, got none")
     device = device_of(args)
     numbers = given(args, *OF_CONFIG)
     if "samples" in numbers:

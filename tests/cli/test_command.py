@@ -33,7 +33,7 @@ def test_options_reach_the_command_and_so_does_its_exit_code(monkeypatch, tmp_pa
 
 
 def test_help_lists_defaults(capsys):
-    for name in ("infer", "render", "data render", "tables"):
+    for name in ("infer", "render", "data render", "data pack", "tables"):
         with pytest.raises(SystemExit):
             main.main([*name.split(), "--help"])
         text = " ".join(capsys.readouterr().out.split())

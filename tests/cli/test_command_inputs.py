@@ -99,6 +99,9 @@ CASES = [
         ]
     ),
     (data, ["render", "file", "--maps", "maps.npz"], "a file"),
+    (data, ["pack", "none", "out"], "none"),
+    (data, ["pack", "empty", "out"], "captures"),
+    (data, ["pack", "good", "out", "--each", "0"], "--each"),
     *(
         (train, ["good", "out", "--stage", *options], word)
         for options, word in [

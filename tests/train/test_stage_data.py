@@ -1,4 +1,4 @@
-"""Sources of objects: real captures and latents of lights."""
+"""Sources of objects: real captures, shards and latents of lights."""
 
 import json
 import os
@@ -9,6 +9,8 @@ import pytest
 import torch
 from PIL import Image
 
+from reli3d.cli.data import main as data
+from reli3d.errors import InputError
 from reli3d.geometry.camera import look_at, project
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
@@ -17,6 +19,8 @@ from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.config import StageConfig
 from reli3d.train.stages.latents import fitted
 from reli3d.train.stages.losses import gradients
+from reli3d.train.stages.shards import Shards, pack
+from reli3d.train.stages.sources import source
 from reli3d.train.stages.step import object_losses
 from reli3d.train.stages.views import Samples, draw
 from tests.support.stages import ball_model, write_samples
@@ -111,6 +115,49 @@ def test_uco3d_objects_are_read():
     index = next(k for k, n in enumerate(names) if n.startswith("UCO3D"))
     views = found.load(index, range)
     assert views.images.shape[1:] == (64, 64, 3) and float(views.masks.mean()) > 0.1
+
+
+def test_shards_contain_the_samples_and_any_reader_reads_them(samples, tmp_path):
+    import webdataset
+
+    assert data(["pack", str(samples), str(tmp_path), "--each", "2"]) == 0
+    packed, plain = Shards(tmp_path), Samples(samples)
+    assert isinstance(source(tmp_path), Shards) and len(packed) == 3
+    for k in range(3):
+        a, b = packed.load(k, lambda total: [2, 0]), plain.load(k, lambda total: [2, 0])
+        for name in ("images", "masks", "c2w", "intrinsics", "material", "normal", "shown"):
+            assert torch.equal(getattr(a, name), getattr(b, name)), name
+    urls = [str(path) for path in sorted(tmp_path.glob("*.tar"))]
+    streamed = [entry["__key__"] for entry in webdataset.WebDataset(urls, shardshuffle=False)]
+    assert streamed == [p.stem for p in plain.files] and len(urls) == 2
+
+
+def test_packing_continues_where_it_stopped(samples, tmp_path):
+    pack(Samples(samples), tmp_path, each=1)
+    (tmp_path / "000001.tar").unlink()
+    times = {p: p.stat().st_mtime_ns for p in tmp_path.glob("*.tar")}
+    pack(Samples(samples), tmp_path, each=1)
+    assert {p: p.stat().st_mtime_ns for p in times} == times and len(Shards(tmp_path)) == 3
+
+
+def test_a_broken_shard_is_refused_by_name(samples, tmp_path):
+    pack(Samples(samples), tmp_path, each=2)
+    content = (tmp_path / "000000.tar").read_bytes()
+    (tmp_path / "000000.tar").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match="000000.tar: expected a tar file, got a broken one"):
+        Shards(tmp_path)
+    for path in tmp_path.glob("*.tar"):
+        path.unlink()
+    with pytest.raises(InputError, match="pack again"):
+        Shards(tmp_path)
+
+
+def test_captures_are_packed_as_they_are_loaded(captures, tmp_path, capsys):
+    assert data(["pack", str(captures), str(tmp_path)]) == 0
+    assert "blurred: left out" in capsys.readouterr().err
+    views, loaded = Shards(tmp_path).load(0, range), Captures(captures).load(0, range)
+    assert views.material is None and views.background
+    assert torch.equal(views.valid, loaded.valid) and float((views.images - loaded.images).abs().max()) < 0.002  # 8 bit
 
 
 def test_latents_decode_to_the_light_and_are_kept(samples, tmp_path):

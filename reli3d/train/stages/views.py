@@ -100,11 +100,13 @@ class Source(Protocol):
 
 
 def sample_views(read: Callable[[str], Any], choose: Chooser) -> ObjectViews:
-    """Views of a sample of :mod:`reli3d.synthetic.samples`.
+    """Views of a sample of :mod:`reli3d.synthetic.samples` or of a capture in a shard.
 
-    read: maps the name of a tensor to the safetensors slice of it, indexed by view; None if missing.
+    read: maps the name of a tensor to the tensor or a safetensors slice of it, indexed by view; None if missing.
     """
-    chosen = list(choose(read("c2w").get_shape()[0]))
+    poses = read("c2w")
+    total = len(poses) if isinstance(poses, Tensor) else poses.get_shape()[0]
+    chosen = list(choose(total))
 
     def of_views(name: str) -> Tensor | None:
         values = read(name)
@@ -112,7 +114,7 @@ def sample_views(read: Callable[[str], Any], choose: Chooser) -> ObjectViews:
 
     images = present("images", of_views("images")) / 255
     c2w, intrinsics = present("c2w", of_views("c2w")), present("intrinsics", of_views("intrinsics"))
-    depth = of_views("view_depth")
+    valid, depth = of_views("view_valid"), of_views("view_depth")
     material, normal, known = of_views("view_material"), of_views("view_normal"), of_views("finish_known")
     if known is not None and not known.all():  # missing ground truth stays None
         material = None
@@ -122,6 +124,7 @@ def sample_views(read: Callable[[str], Any], choose: Chooser) -> ObjectViews:
         c2w,
         intrinsics,
         background=True,
+        valid=valid,
         material=None if material is None else material / 255,
         normal=None if normal is None else normalize(normal, dim=-1),
         shown=None if depth is None else (depth > 0).float(),

@@ -1,0 +1,103 @@
+"""Training objects in WebDataset tar files: one ``<object>.safetensors`` per object."""
+
+import tarfile
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor
+
+from reli3d.errors import InputError
+from reli3d.io.files import replacing
+from reli3d.train.stages.captures import Captures
+from reli3d.train.stages.views import Chooser, ObjectViews, Samples, sample_views
+
+STORED_TENSORS = (
+    "images",
+    "c2w",
+    "intrinsics",
+    "view_material",
+    "view_normal",
+    "view_depth",
+    "environment",
+    "finish_known",
+)
+
+
+def to_tensors(views: ObjectViews) -> dict[str, Tensor]:
+    """Tensors stored for a capture, in the layout of :mod:`reli3d.synthetic.samples`."""
+    images = torch.cat([views.images, views.masks[..., None]], -1)
+    stored = {
+        "images": (images * 255 + 0.5).to(torch.uint8),
+        "c2w": views.c2w,
+        "intrinsics": views.intrinsics,
+        "background": torch.tensor(views.background),
+    }
+    if views.valid is not None:
+        stored["view_valid"] = views.valid.to(torch.uint8)
+    return {k: v.contiguous() for k, v in stored.items()}
+
+
+def _objects(source: Samples | Captures, numbers: Iterable[int]) -> Iterator[tuple[str, bytes]]:
+    for k in numbers:
+        if isinstance(source, Samples):
+            tensors = load(source.files[k].read_bytes())
+            yield source.files[k].stem, save({n: tensors[n] for n in STORED_TENSORS if n in tensors})
+        else:
+            yield source.folders[k].name, save(to_tensors(source.load(k, range)))
+
+
+def pack(
+    source: Samples | Captures, folder: Path, *, each: int = 64, progress: Callable[[str], None] = lambda line: None
+) -> None:
+    """Writes the objects of ``source`` to ``NNNNNN.tar``, ``each`` per file; existing files are kept.
+
+    Raises InputError if the package ``webdataset`` is missing.
+    """
+    try:
+        from webdataset import TarWriter
+    except ImportError:
+        raise InputError("pack", "expected the package webdataset, got none; pip install webdataset") from None
+    folder.mkdir(parents=True, exist_ok=True)
+    total = len(source)
+    for number, first in enumerate(range(0, total, each)):
+        path = folder / f"{number:06d}.tar"
+        if path.exists():
+            continue
+        with replacing(path) as temporary, TarWriter(str(temporary)) as writer:
+            for name, data in _objects(source, range(first, min(first + each, total))):
+                writer.write({"__key__": name, "safetensors": data})
+        progress(f"{path.name}: {min(first + each, total)} of {total} objects")
+
+
+class Shards:
+    """The objects of a folder of shards, by index.  Raises InputError if a shard is broken or there is none."""
+
+    def __init__(self, folder: Path):
+        self.places: list[tuple[Path, int, int]] = []  # shard, offset and length of the object's bytes
+        for path in sorted(folder.glob("*.tar")):
+            try:
+                with tarfile.open(path, "r:") as tar:
+                    found = [(path, m.offset_data, m.size) for m in tar if m.name.endswith(".safetensors")]
+            except (tarfile.TarError, OSError) as error:
+                raise InputError(path, f"expected a tar file, got a broken one ({error}); pack it again") from None
+            self.places += found
+        if not self.places:
+            raise InputError(folder, "expected tar files with *.safetensors entries, got none; pack again")
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def load(self, index: int, choose: Chooser) -> ObjectViews:
+        path, offset, length = self.places[index]
+        with open(path, "rb") as file:
+            file.seek(offset)
+            data = file.read(length)
+        try:
+            stored = load(data)
+        except SafetensorError as error:
+            raise InputError(path, f"expected a sample at byte {offset}, got a broken one ({error})") from None
+        return replace(sample_views(stored.get, choose), background=bool(stored.get("background", True)))
