@@ -37,7 +37,6 @@ class Weights:
     light: float = 3e-3  # pulls the lighting to the start
     light_variation: float = 2e-3  # of :func:`total_variation` of the lighting
     exposure: float = 0.1  # of squared log exposures; their mean is ambiguous with the scale of the lighting
-    demodulation: float = 0.0  # of :func:`shared_pattern`; off: it prevents corrections of a wrong base color too
     free_bend: float = 2e-3  # of the squared bend while the material is fitted; multiplied by the number of views
     bend: float = 20.0  # of the squared bend that is kept; divided by the squared number of views
 
@@ -156,14 +155,3 @@ def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
     loss = loss + weights.light * near_start(unknowns.light)
     loss = loss + weights.light_variation * torch.stack([total_variation(m) for m in light_maps(unknowns.light)]).sum()
     return loss + weights.exposure * unknowns.exposure.square().mean()
-
-
-def shared_pattern(change: Tensor, shading: Tensor) -> Tensor:
-    """Squared correlation, over points, of the change of log base color ``(N,)`` and log shading ``(N,)``.
-
-    Base color and shading are independent.  A change of the base color that correlates with the shading, positively or
-    negatively, bakes an error of the lighting into it (after Hasselgren, Hofmann and Munkberg 2022, Shape, Light, and
-    Material Decomposition, section 3: demodulation).
-    """
-    a, b = change - change.mean(), (shading - shading.mean()).detach()
-    return (a * b).mean().square() / (b.square().mean() + 1e-4)

@@ -155,12 +155,7 @@ def maps_loss(
     loss = loss + weights.palette * losses.palette(color, target) + weights.hue * losses.hue_drift(color, was)
     loss = loss + losses.priors(unknowns, weights, len(data.used))
     loss = loss + losses.near_base_color(change[:, :3], weights, len(data.used))
-    loss = loss + weights.bend * turned.square().sum(1).mean()
-    if weights.demodulation:
-        bright = other.detach().mean(1) / points.base_color.detach().mean(1).clamp(min=0.02)
-        shading = bright.clamp(min=1e-3).log()
-        loss = loss + weights.demodulation * losses.shared_pattern(change[:, :3].mean(1), shading)
-    return loss
+    return loss + weights.bend * turned.square().sum(1).mean()
 
 
 def fading(progress: float, settled: bool) -> float:

@@ -10,7 +10,7 @@ from reli3d.fit import refine as fit
 from reli3d.fit.budget import Budget
 from reli3d.fit.choice import PSNR_TOLERANCE_DB, Fitted, Parts
 from reli3d.fit.input_images import InputImages
-from reli3d.fit.losses import Weights, agreement, display_error, hue_drift, palette, shared_pattern
+from reli3d.fit.losses import Weights, agreement, display_error, hue_drift, palette
 from reli3d.fit.transfer import transfer_textures
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.render.color import srgb_to_linear
@@ -189,12 +189,6 @@ def test_the_mean_hue_is_held_and_neither_brightness_nor_patterns():
     assert float(hue_drift(start - 0.7 + pattern, start)) < 1e-9
     # a factor of e on red alone: drifts of 2/3, -1/3 and -1/3, mean square (4 + 1 + 1) / 27
     assert float(hue_drift(start + torch.tensor([1.0, 0.0, 0.0]), start)) == pytest.approx(6 / 27, rel=1e-5)
-
-
-def test_the_shared_pattern_sees_baked_shading():
-    rng = torch.Generator().manual_seed(1)
-    shading, other = torch.randn(4000, generator=rng), torch.randn(4000, generator=rng)
-    assert float(shared_pattern(0.3 * shading, shading)) > 20 * float(shared_pattern(0.3 * other, shading))
 
 
 def test_maps_move_to_another_surface():
