@@ -16,6 +16,7 @@ from reli3d.fit.budget import Budget, progress_bar
 from reli3d.fit.choice import UNCHANGED, Fitted, Parts, chosen, mean_psnr, view_errors
 from reli3d.fit.input_images import InputImages, PosedImages
 from reli3d.fit.light_frame import light_follows_camera
+from reli3d.fit.light_hue import CHROMATICITY_WEIGHT, with_neutral_light
 from reli3d.fit.maps import FixedSurface, MapsStage, fit_maps
 from reli3d.fit.shape import ShapeData, finished, fit_shape, start_grid
 from reli3d.fit.transfer import transfer_textures
@@ -35,13 +36,15 @@ class RefineOptions:
     """Options of :func:`refine`.
 
     resolution: of :func:`~reli3d.fit.shape.start_grid`.  cameras: optimize the poses as well.  light: of
-    :meth:`InputImages.of`; unless ``object``, the result has the lighting of view 0.
+    :meth:`InputImages.of`; unless ``object``, the result has the lighting of view 0.  light_chromaticity: weight of
+    :func:`~reli3d.fit.light_hue.with_neutral_light`; 1 keeps the lighting of a start whose lighting is known.
     """
 
     resolution: int = RESOLUTION
     weights: losses.Weights = losses.Weights()  # noqa: RUF009 # it is frozen
     cameras: bool = False
     light: str | Sequence[Hashable] = "object"
+    light_chromaticity: float = CHROMATICITY_WEIGHT
     seed: int = 0
 
 
@@ -127,6 +130,7 @@ def refine(
     first, near = _moved(asset, shift, scale), images.moved(shift, scale)
     received = gathered(first.mesh, near.select(used), seed=options.seed)
     before = view_errors(first, received, near)
+    first = with_neutral_light(first, options.light_chromaticity)
     notes: list[str] = []
     if images.light_moves:
         notes.append("refinement: the lighting moves with the camera; the environment is that of view 0")
@@ -146,6 +150,7 @@ def refine(
     if budget.interrupted:
         notes.append("refinement: interrupted, the best result so far is kept")
     notes.append(f"refinement: {parts}")
+    after = before if parts == UNCHANGED else after
     was, now = ((mean_psnr(e[used]), mean_psnr(e[list(held)])) for e in (before, after))
     if parts == UNCHANGED:
         return Refinement(asset, parts, was, now, held, views.c2w, tuple(notes), budget.curve, budget.counts)

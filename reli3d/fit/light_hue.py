@@ -1,0 +1,36 @@
+"""Chromaticity of a start's lighting: reduced, because part of it belongs to the object."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+
+from reli3d.render.asset import Asset
+from reli3d.render.environment import Environment
+from reli3d.render.latlong import texel_solid_angles
+
+# Slope of the true against the predicted mean log chromaticity of the lighting on 20 validation samples: 0.12 between
+# green and magenta, 0.27 between red and blue.
+CHROMATICITY_WEIGHT = 0.25
+MAX_FACTOR = 1.5  # largest change of a channel; lightings with a stronger color are not in the samples
+MIN_RADIANCE = 1e-6  # the logarithm must be finite
+
+
+@torch.no_grad()
+def with_neutral_light(asset: Asset, weight: float = CHROMATICITY_WEIGHT) -> Asset:
+    """``asset`` with less saturated lighting: log chromaticity of its mean radiance times ``weight``.
+
+    The base color is divided by the same factor per channel, at most to 1, so that diffuse colors stay the same.
+    Highlights of nonmetals have the color of the lighting, so images are less saturated than base colors; a prediction
+    from images therefore assigns part of the object's color to the lighting.
+    """
+    radiance = asset.light.radiance
+    angle = texel_solid_angles(*radiance.shape[:2]).to(radiance)[:, None, None]
+    color = ((angle * radiance).sum((0, 1)) / (4.0 * math.pi)).clamp(min=MIN_RADIANCE).log()
+    factor = ((weight - 1.0) * (color - color.mean())).exp().clamp(1.0 / MAX_FACTOR, MAX_FACTOR)
+    base_color = (asset.textures.base_color / factor).clamp(max=1.0)
+    return replace(
+        asset, textures=replace(asset.textures, base_color=base_color), environment=Environment(radiance * factor)
+    )

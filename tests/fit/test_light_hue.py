@@ -1,0 +1,41 @@
+"""The start's lighting becomes less saturated, and colors of diffuse surfaces stay the same."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from reli3d.fit.light_hue import CHROMATICITY_WEIGHT, MAX_FACTOR, with_neutral_light
+from reli3d.render.environment import Environment
+from tests.support import small_scene
+
+
+def lit(color) -> Environment:
+    rows = torch.linspace(2.0, 0.1, 16)[:, None, None]
+    return Environment((rows * torch.tensor(color)).expand(16, 32, 3).contiguous())
+
+
+def test_the_log_chromaticity_of_the_lighting_is_scaled_and_products_stay_the_same():
+    start = replace(small_scene.ball(), environment=lit([1.2, 1.0, 0.8]))
+    got = with_neutral_light(start)
+    before, after = (a.light.radiance[3, 5].log() for a in (start, got))
+    torch.testing.assert_close(after - after.mean(), CHROMATICITY_WEIGHT * (before - before.mean()))
+    assert float(after.mean()) == pytest.approx(float(before.mean()), abs=1e-6)  # the brightness stays
+    products = [a.textures.base_color * a.light.radiance[3, 5] for a in (start, got)]
+    torch.testing.assert_close(*products)
+
+
+def test_weight_one_keeps_the_start():
+    start = replace(small_scene.ball(), environment=lit([1.2, 1.0, 0.8]))
+    assert torch.equal(with_neutral_light(start, 1.0).light.radiance, start.light.radiance)
+
+
+def test_gray_and_black_lighting_stay_the_same_and_strong_colors_change_by_a_limited_factor():
+    for color in ([0.7, 0.7, 0.7], [0.0, 0.0, 0.0]):
+        start = replace(small_scene.ball(), environment=lit(color))
+        got = with_neutral_light(start)
+        torch.testing.assert_close(got.light.radiance, start.light.radiance)
+        torch.testing.assert_close(got.textures.base_color, start.textures.base_color)
+    start = replace(small_scene.ball(), environment=lit([1.0, 0.0, 0.0]))
+    ratio = with_neutral_light(start).textures.base_color / start.textures.base_color
+    assert float(ratio.max()) <= MAX_FACTOR + 1e-5 and float(ratio.min()) >= 1.0 / MAX_FACTOR - 1e-5
