@@ -23,7 +23,7 @@ TEXEL = 1.5  # pixels of the images, at the cameras' median distance
 ROWS, GAIN_STEP = 64, 4  # texels: rows at a time; gains are compared at every fourth in both directions
 TEXTURE_REACH = 0.9  # of the cameras' median distance: half the side of the textured square
 FEWEST_SAMPLES = 4  # views that show a texel
-COVER_MARGIN = 0.01  # of the longer side: around the object its outline is uncertain, and texels are not taken
+COVER_MARGIN, MASK_MARGIN = 0.01, 0.004  # of the longer side: around what hides the plane its outline is uncertain
 LEAST_SPREAD, MOST_SPREAD = 3.0, 25.0  # of 255: standard deviation of a texel over the views, and where it is unknown
 DARKEST = 8.0  # of 255: darker texels are counted as this bright in gains
 UNLIKE_PLANE = 3.0  # spreads from which a pixel does not show the plane
@@ -86,7 +86,7 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
         inside, cover = (
             [full_size(m, s.image.shape) > 127 for m, s in zip(x, smalls, strict=True)] for x in (inside, cover)
         )
-        texture = _plane_texture(smalls, cover, axes, scene)
+        texture = _plane_texture(smalls, inside, cover, axes, scene)
         expected = [_expected(texture, axes, s) for s in smalls]
         evidence = _evidence(smalls, inside, expected)
         occupied, cell = _occupied(smalls, evidence, axes, box, points, cells, growth)
@@ -112,22 +112,30 @@ class _Texture:
     spread: np.ndarray
 
 
-def _plane_texture(smalls: Sequence[_Small], inside: Sequence[np.ndarray], axes: _Axes, scene: Scene) -> _Texture:
-    """Median over views, after one gain for each view and channel, of what they show outside the masks."""
+def _plane_texture(
+    smalls: Sequence[_Small], inside: Sequence[np.ndarray], cover: Sequence[np.ndarray], axes: _Axes, scene: Scene
+) -> _Texture:
+    """Median over views, after one gain for each view and channel, of what they show outside ``cover``.
+
+    Where FEWEST_SAMPLES of them show a texel outside the masks ``inside`` too, these alone are taken: ``cover`` lacks
+    the low parts of the object.
+    """
     cell = TEXEL * scene.distance / float(np.median([s.view.focal * s.scale for s in smalls]))
     count = int(2 * TEXTURE_REACH * scene.distance / cell)
     at = (np.arange(count) + 0.5 - count / 2) * cell
-    covered = []
-    for mask in inside:
-        margin = 2 * round(COVER_MARGIN * max(mask.shape)) + 1
-        covered.append(cv2.dilate(mask.astype(np.uint8), np.ones((margin, margin), np.uint8)))
-    coarse = _plane_samples(smalls, covered, axes, at[::GAIN_STEP], at[::GAIN_STEP])
+    hidden = [
+        np.where(_grown(c, COVER_MARGIN) > 0, np.uint8(2), _grown(m, MASK_MARGIN))
+        for m, c in zip(inside, cover, strict=True)
+    ]
+    coarse, _ = _plane_samples(smalls, hidden, axes, at[::GAIN_STEP], at[::GAIN_STEP])
     reference = _median(coarse)
     gains = np.stack([_gain(s, reference) for s in coarse])[:, None, None]
     color, spread = np.zeros((count, count, 3), np.float32), np.zeros((count, count), np.float32)
     for first in range(0, count, ROWS):
         rows = slice(first, first + ROWS)
-        stack = _plane_samples(smalls, covered, axes, at, at[rows]) / gains
+        stack, outside = _plane_samples(smalls, hidden, axes, at, at[rows])
+        stack /= gains
+        stack[~outside & (np.count_nonzero(outside, axis=0) >= FEWEST_SAMPLES)] = np.nan
         middle = _median(stack)
         deviation = 1.4826 * _median(np.abs(stack - middle)).max(-1)
         known = np.count_nonzero(~np.isnan(stack[..., 0]), axis=0) >= FEWEST_SAMPLES
@@ -136,17 +144,29 @@ def _plane_texture(smalls: Sequence[_Small], inside: Sequence[np.ndarray], axes:
     return _Texture(cell, color, spread)
 
 
-def _plane_samples(smalls, covered: Sequence[np.ndarray], axes: _Axes, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Colors ``(V, len(v), len(u), 3)`` of points of the plane in each view, NaN where it does not show them."""
+def _grown(mask: np.ndarray, margin: float) -> np.ndarray:
+    size = 2 * round(margin * max(mask.shape)) + 1
+    return cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
+
+
+def _plane_samples(
+    smalls, hidden: Sequence[np.ndarray], axes: _Axes, u: np.ndarray, v: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colors ``(V, len(v), len(u), 3)`` of points of the plane in each view, NaN where it does not show them or
+    ``hidden`` is 2; and where it shows them and ``hidden`` is 0.
+    """
     grid = np.stack([*np.meshgrid(u, v)], -1).reshape(-1, 2) @ axes.axes[:2] + axes.origin
     samples = np.zeros((len(smalls), len(v), len(u), 3), np.float32)
-    for sample, small, cover in zip(samples, smalls, covered, strict=True):
+    outside = np.zeros(samples.shape[:3], bool)
+    for k, (small, values) in enumerate(zip(smalls, hidden, strict=True)):
         pixels, depth = small.project(grid)
         x, y = (pixels.T - 0.5).astype(np.float32).reshape(2, len(v), len(u))
-        sample[:] = cv2.remap(small.image, x, y, cv2.INTER_LINEAR)
-        free = cv2.remap(1 - cover, x, y, cv2.INTER_NEAREST, borderValue=0) > 0
-        sample[~free | (depth.reshape(free.shape) <= 0)] = np.nan
-    return samples
+        samples[k] = cv2.remap(small.image, x, y, cv2.INTER_LINEAR)
+        found = cv2.remap(values, x, y, cv2.INTER_NEAREST, borderValue=2)
+        found[depth.reshape(found.shape) <= 0] = 2
+        samples[k][found == 2] = np.nan
+        outside[k] = found == 0
+    return samples, outside
 
 
 def _median(stack: np.ndarray) -> np.ndarray:
