@@ -170,6 +170,8 @@ def in_processes(start: Callable[[], Job], items: Sequence[Item], count: int) ->
             try:
                 return pool.submit(_made, job, item)
             except BrokenProcessPool:  # a worker crashed before
+                for process in active_children():  # Python 3.11 waits forever for one started while the pool broke
+                    process.terminate()
                 pool = _pool(count)
                 return pool.submit(_made, job, item)
 
@@ -230,7 +232,10 @@ def _rows(
     *,
     alone: bool,
 ) -> Rows:
-    """Keeps ``limit()`` objects submitted; one that raises ``crash``, which breaks all futures, is retried alone."""
+    """Keeps ``limit()`` objects submitted; one that raises ``crash`` is retried.
+
+    alone: a crash breaks all futures, and an object is retried while no other runs.
+    """
     left, again, running = deque(items), deque[Item](), dict[Future, tuple[Item, bool]]()
     while left or again or running:
         if again and not (alone and running):
@@ -239,9 +244,14 @@ def _rows(
         while left and len(running) < limit() and not (alone and (again or any(r for _, r in running.values()))):
             item = left.popleft()
             running[submit(item)] = item, False
-        for future in wait(running, POLL, FIRST_COMPLETED).done:
+        done = wait(running, POLL, FIRST_COMPLETED).done
+        if alone and any(isinstance(future.exception(), crash) for future in done):
+            done = set(running)  # Python 3.11 never ends one submitted while its pool broke
+        for future in done:
             item, retried = running.pop(future)
             try:
+                if not future.done():
+                    raise crash
                 row = future.result()
                 made = "done" if retried and row.result == "skipped" else row.result  # before another worker crashed
                 yield replace(row, result=made, retried=retried)

@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,12 +14,19 @@ from reli3d.output.folder import claimed
 FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "viewer.html", "run_info.json")
 
 
+def wait(ready: Callable[[], bool]) -> None:
+    until = time.monotonic() + 60
+    while time.monotonic() < until and not ready():
+        time.sleep(0.02)
+
+
 @dataclass
 class WordJob:
     """Writes the word of ``folder/word`` in ``target``, and a line in ``log`` for every result that it finishes.
 
     The words ``crash`` and ``crash once`` kill the process in the middle of the work, ``wait`` waits there for a file
-      ``go``; ``refuse`` and ``fail`` are errors.  Their files are in ``folder``.
+      ``go``; ``refuse`` and ``fail`` are errors.  Their files are in ``folder``.  A ``crash`` waits for each ``crash
+      once`` before it, which would have a second crash else.
     """
 
     log: Path
@@ -34,14 +42,15 @@ class WordJob:
         with claimed(target, FILES) as replacing, replacing() as new:
             for file in FILES:
                 (new / file).write_text(word)
+            once = [p.parent for p in folder.parent.glob("*/word") if p.read_text() == "crash once"]
+            if word == "crash":
+                wait(lambda: all((p / "crashed").exists() for p in once if p.name < folder.name))
             if word == "crash" or (word == "crash once" and not (folder / "crashed").exists()):
                 (folder / "crashed").touch()
                 os.kill(os.getpid(), signal.SIGKILL)
             if word == "wait":
                 (folder / "waits").touch()
-                until = time.monotonic() + 60
-                while time.monotonic() < until and not (folder / "go").exists():
-                    time.sleep(0.02)
+                wait((folder / "go").exists)
             info = {"mask_iou": 0.5, "mesh": {"faces": len(word)}, "notes": [f"pid {os.getpid()}"]}
             (new / "run_info.json").write_text(json.dumps(info))
         with open(self.log, "a") as log:
