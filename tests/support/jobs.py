@@ -33,29 +33,33 @@ class WordJob:
 
     def run(self, folder, name: str, target: Path) -> str:
         word = (folder / "word").read_text()
-        if (target / "mesh.glb").exists():
-            return "skipped"
-        if word == "refuse":
-            raise InputError("word", "expected another, got refuse")
-        if word == "fail":
-            raise RuntimeError("it failed")
-        with claimed(target, FILES) as replacing, replacing() as new:
-            for file in FILES:
-                (new / file).write_text(word)
-            once = [p.parent for p in folder.parent.glob("*/word") if p.read_text() == "crash once"]
-            if word == "crash":
-                wait(lambda: all((p / "crashed").exists() for p in once if p.name < folder.name))
-            if word == "crash" or (word == "crash once" and not (folder / "crashed").exists()):
-                (folder / "crashed").touch()
-                os.kill(os.getpid(), signal.SIGKILL)
-            if word == "wait":
-                (folder / "waits").touch()
-                wait((folder / "go").exists)
-            info = {"mask_iou": 0.5, "mesh": {"faces": len(word)}, "notes": [f"pid {os.getpid()}"]}
-            (new / "run_info.json").write_text(json.dumps(info))
+        with claimed(target, FILES) as replacing:
+            if (target / "mesh.glb").exists():
+                return "skipped"
+            if word == "refuse":
+                raise InputError("word", "expected another, got refuse")
+            if word == "fail":
+                raise RuntimeError("it failed")
+            with replacing() as new:
+                self._write(folder, word, new)
         with open(self.log, "a") as log:
             log.write(f"{name}\n")
         return "done"
+
+    def _write(self, folder: Path, word: str, new: Path) -> None:
+        for file in FILES:
+            (new / file).write_text(word)
+        once = [p.parent for p in folder.parent.glob("*/word") if p.read_text() == "crash once"]
+        if word == "crash":
+            wait(lambda: all((p / "crashed").exists() for p in once if p.name < folder.name))
+        if word == "crash" or (word == "crash once" and not (folder / "crashed").exists()):
+            (folder / "crashed").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        if word == "wait":
+            (folder / "waits").touch()
+            wait((folder / "go").exists)
+        info = {"mask_iou": 0.5, "mesh": {"faces": len(word)}, "notes": [f"pid {os.getpid()}"]}
+        (new / "run_info.json").write_text(json.dumps(info))
 
     def start(self) -> "Start":
         """Makes this job in another process."""
