@@ -33,7 +33,7 @@ from reli3d.geometry.uv import source_vertices, unwrap, unwrap_xatlas
 from reli3d.nn.blocks import in_rows, submit
 from reli3d.nn.field import CHUNK, Field, TriplaneField
 from reli3d.nn.local import HEAD_OUTPUTS, VIEW_WEIGHT, LocalField, LocalReconstructor
-from reli3d.nn.presets import LocalPreset, Preset
+from reli3d.nn.presets import CALIBRATED_VIEWS, LocalPreset, Preset
 from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import Network, load_model
 from reli3d.prepare import Prepared, completed, prepare, published_input
@@ -57,7 +57,7 @@ MIN_PART_FRACTION = 0.01  # of the faces; smaller components are removed
 TEXELS = 1 << 19  # evaluated at once on a CPU: 100 bytes each
 SHADING_POINTS = 4096  # vertices from which the lighting on the object is estimated
 OUTSIDE_FIELD = 1.0  # field value of grid points outside the visual hull
-NORMAL_LENGTH = 0.03  # model units, under two cells: predicted normals determine the shape of smaller features
+NORMAL_LENGTH = 0.03  # model units: up to four views, predicted normals determine the shape of smaller features
 NORMAL_WEIGHT, MAX_NORMAL_WEIGHT = 8.0, 3.0  # of predicted normals, divided by the views: shape improves with them
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
 
@@ -109,7 +109,8 @@ def _with_predicted_normals(field: LocalField, mesh: Mesh) -> Mesh:
     weight = min(MAX_NORMAL_WEIGHT, NORMAL_WEIGHT / field.maps.input_count) * fused.numbers[:, VIEW_WEIGHT, None]
     target = functional.normalize(normal + weight * fused.normal, dim=-1)
     inside = -field.bound(position) * field.model.preset.softness
-    return displace_to_normals(mesh, target, length=NORMAL_LENGTH, limit=inside.clamp(min=0.0))
+    length = NORMAL_LENGTH * min(1.0, CALIBRATED_VIEWS / field.maps.input_count)
+    return displace_to_normals(mesh, target, length=length, limit=inside.clamp(min=0.0))
 
 
 def _free_surface(field: TriplaneField, resolution: int) -> Mesh:
