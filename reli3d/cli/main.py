@@ -16,6 +16,7 @@ COMMANDS = {  # module of reli3d.cli, purpose
     "download": ("download", "fetch and convert the published ReLi3D network"),
     "data": ("data", "render training samples (also reli3d-data)"),
     "train": ("train", "train the network (also reli3d-train)"),
+    "eval": ("eval", "evaluate the network on held-out objects (also reli3d-eval)"),
     "tables": ("tables", "tables of the ReLi3D paper on a folder of GLB files (also reli3d-tables)"),
     "doctor": ("doctor", "print versions and devices, and whether the package is usable"),
 }

@@ -1,6 +1,7 @@
 """Validation of training samples by their file headers."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
@@ -61,10 +62,13 @@ def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True
         raise InputError(path, f"views: expected at least {views}, got {sizes['V']}; make samples of more views")
 
 
-def check_samples(folder: Path, name: str, *, views: int = 1, points: bool = True) -> list[Path]:
+def check_samples(
+    folder: Path, name: str, *, views: int = 1, points: bool = True, also: Callable[[Path], None] = lambda path: None
+) -> list[Path]:
     """All sample files of ``folder``, checked.  Raises InputError if one is invalid or there is none.
 
-    name: of the option or argument for error messages.  views, points: as in :func:`check_sample`.
+    name: of the option or argument for error messages.  views, points: as in :func:`check_sample`.  also: additional
+    check of each file.
     """
     if not folder.is_dir():
         raise InputError(name, f"expected a folder of samples, got {shown(str(folder))}; make them with reli3d-data")
@@ -72,5 +76,6 @@ def check_samples(folder: Path, name: str, *, views: int = 1, points: bool = Tru
     if not files:
         raise InputError(name, f"expected *.safetensors files, got none in {folder}; make them with reli3d-data")
     for path in files:
+        also(path)
         check_sample(path, views=views, points=points)
     return files

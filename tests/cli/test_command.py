@@ -10,9 +10,9 @@ from reli3d.cli import doctor, main
 def test_help_names_every_command_and_the_old_names(capsys):
     assert main.main([]) == 0
     text = capsys.readouterr().out
-    for name in ("infer", "check", "render", "download", "data", "train", "tables", "doctor"):
+    for name in ("infer", "check", "render", "download", "data", "train", "eval", "tables", "doctor"):
         assert re.search(rf"^  {name} ", text, re.MULTILINE)
-    for name in ("infer", "render", "data", "train", "tables"):
+    for name in ("infer", "render", "data", "train", "eval", "tables"):
         assert f"reli3d-{name}" in text
 
 
@@ -33,7 +33,7 @@ def test_options_reach_the_command_and_so_does_its_exit_code(monkeypatch, tmp_pa
 
 
 def test_help_lists_defaults(capsys):
-    for name in ("infer", "render", "data render", "data pack", "tables"):
+    for name in ("infer", "render", "data render", "data pack", "eval"):
         with pytest.raises(SystemExit):
             main.main([*name.split(), "--help"])
         text = " ".join(capsys.readouterr().out.split())

@@ -1,4 +1,4 @@
-"""``reli3d-render``, ``-data`` and ``-train`` on invalid input: one line, exit code 2, before any work."""
+"""``reli3d-render``, ``-data``, ``-train`` and ``-eval`` on invalid input: one line, exit code 2, before any work."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ import torch
 from safetensors.torch import save_file
 
 from reli3d.cli import data, render, train
+from reli3d.cli import eval as evaluation
 from reli3d.errors import InputError
 from reli3d.synthetic.stored import OPTIONAL, TENSORS, check_sample
 
@@ -27,6 +28,7 @@ def place(tmp_path, monkeypatch):
     """A folder with good samples, broken ones, maps, broken maps, a file, and checkpoints that are none."""
     monkeypatch.chdir(tmp_path)
     sample(tmp_path / "good/0000000003.safetensors")
+    sample(tmp_path / "named/chair.safetensors")
     sample(tmp_path / "lacks/0000000003.safetensors", points=None)
     sample(tmp_path / "few/0000000003.safetensors", c2w=torch.zeros(3, 4, 4))
     whole = (tmp_path / "good/0000000003.safetensors").read_bytes()
@@ -149,6 +151,19 @@ CASES = [
     (train, ["good", "run_noise"], "broken file"),
     (train, ["good", "run_other"], "run_other/state.pt"),
     (train, ["good", "run_noise", "--export", "x.safetensors"], "broken file"),
+    *(
+        (evaluation, [folder, "--maps", maps, *options], word)
+        for folder, maps, options, word in [
+            ("none", "maps.npz", [], "folder of samples"),
+            ("named", "maps.npz", [], "seed"),
+            ("cut", "maps.npz", [], "broken file"),
+            ("good", "cut.npz", [], "broken file"),
+            ("good", "maps.npz", ["--json", "file/x"], "a file"),
+            ("good", "maps.npz", ["--json", "good"], "a folder"),
+            ("good", "maps.npz", ["--weights", "none"], "none"),
+            ("good", "maps.npz", ["--views", "8"], "expected at least 16, got 12"),
+        ]
+    ),
 ]
 
 
