@@ -58,7 +58,7 @@ TEXELS = 1 << 19  # evaluated at once on a CPU: 100 bytes each
 SHADING_POINTS = 4096  # vertices from which the lighting on the object is estimated
 OUTSIDE_FIELD = 1.0  # field value of grid points outside the visual hull
 NORMAL_LENGTH = 0.03  # model units: up to four views, predicted normals determine the shape of smaller features
-NORMAL_WEIGHT, MAX_NORMAL_WEIGHT = 8.0, 3.0  # of predicted normals, divided by the views: shape improves with them
+NORMAL_WEIGHT, MAX_NORMAL_WEIGHT = 8.0, 3.0  # of predicted normals; divided by the number of views
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
 
 

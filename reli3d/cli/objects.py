@@ -164,16 +164,16 @@ def in_processes(start: Callable[[], Job], items: Sequence[Item], count: int) ->
     """Runs objects in ``count`` processes; rows in order of completion.  start: creates the job, is pickled."""
     job, pool = pickle.dumps((os.getcwd(), start)), _pool(count)
 
-    def submit(item: Item) -> Future:
+    def submit(item: Item) -> tuple[Future, object]:
         nonlocal pool
         with _blocked_interrupts():
             try:
-                return pool.submit(_made, job, item)
+                return pool.submit(_made, job, item), pool
             except BrokenProcessPool:  # a worker crashed before
                 for process in active_children():  # Python 3.11 waits forever for one started while the pool broke
                     process.terminate()
                 pool = _pool(count)
-                return pool.submit(_made, job, item)
+                return pool.submit(_made, job, item), pool
 
     try:
         yield from _rows(submit, items, lambda: count, BrokenProcessPool, alone=True)
@@ -218,14 +218,14 @@ def _on_ray(ray, start: Callable[[], Job], items: Sequence[Item], gpu: bool) -> 
         return 2 * int(ray.cluster_resources().get("CPU", 1)) + 2
 
     try:
-        submit = lambda item: task.remote(job, item).future()  # noqa: E731
+        submit = lambda item: (task.remote(job, item).future(), None)  # noqa: E731
         yield from _rows(submit, items, ahead, ray.exceptions.WorkerCrashedError, alone=False)
     finally:
         ray.shutdown()
 
 
 def _rows(
-    submit: Callable[[Item], Future],
+    submit: Callable[[Item], tuple[Future, object]],
     items: Sequence[Item],
     limit: Callable[[], int],
     crash: type[Exception],
@@ -234,21 +234,24 @@ def _rows(
 ) -> Rows:
     """Keeps ``limit()`` objects submitted; one that raises ``crash`` is retried.
 
-    alone: a crash breaks all futures, and an object is retried while no other runs.
+    submit: returns a future and its pool.  alone: a crash breaks all futures of a pool, and an object is retried while
+    no other runs.
     """
-    left, again, running = deque(items), deque[Item](), dict[Future, tuple[Item, bool]]()
+    left, again, running = deque(items), deque[Item](), dict[Future, tuple[Item, bool, object]]()
     while left or again or running:
         if again and not (alone and running):
             item = again.popleft()
-            running[submit(item)] = item, True
-        while left and len(running) < limit() and not (alone and (again or any(r for _, r in running.values()))):
+            future, pool = submit(item)
+            running[future] = item, True, pool
+        while left and len(running) < limit() and not (alone and (again or any(r for _, r, _ in running.values()))):
             item = left.popleft()
-            running[submit(item)] = item, False
+            future, pool = submit(item)
+            running[future] = item, False, pool
         done = wait(running, POLL, FIRST_COMPLETED).done
-        if alone and any(isinstance(future.exception(), crash) for future in done):
-            done = set(running)  # Python 3.11 never ends one submitted while its pool broke
-        for future in done:
-            item, retried = running.pop(future)
+        broken = [running[future][2] for future in done if alone and isinstance(future.exception(), crash)]
+        # Python 3.11 never ends a future that was submitted while its pool broke
+        for future in done | {future for future, (_, _, pool) in running.items() if pool in broken}:
+            item, retried, _ = running.pop(future)
             try:
                 if not future.done():
                     raise crash

@@ -22,7 +22,8 @@ MIN_RADIANCE = 1e-6  # the logarithm must be finite
 def with_neutral_light(asset: Asset, weight: float = CHROMATICITY_WEIGHT) -> Asset:
     """``asset`` with less saturated lighting: log chromaticity of its mean radiance times ``weight``.
 
-    The base color is divided by the same factor per channel, at most to 1, so that diffuse colors stay the same.
+    The factor of a channel is limited to [1 / MAX_FACTOR, MAX_FACTOR].  The base color is divided by it and clipped at
+    1; below, diffuse colors in images do not change.
     Highlights of nonmetals have the color of the lighting, so images are less saturated than base colors; a prediction
     from images therefore assigns part of the object's color to the lighting.
     """

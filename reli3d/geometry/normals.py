@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix, diags
-from scipy.sparse.linalg import cg
+from scipy.sparse import coo_matrix, diags, spmatrix
 from torch import Tensor
 
 from reli3d._bridge import check, present
 from reli3d.geometry.mesh import Mesh, vertex_normals
 
-TOLERANCE, MAX_ITERATIONS = 1e-3, 200  # of conjugate gradients; relative to the right side
+TOLERANCE, MAX_ITERATIONS = 1e-3, 200  # of conjugate gradients: preconditioned residual relative to the first, steps
 
 
 def displace_to_normals(mesh: Mesh, target: Tensor, *, length: float, limit: Tensor) -> Mesh:
@@ -44,8 +43,26 @@ def displace_to_normals(mesh: Mesh, target: Tensor, *, length: float, limit: Ten
     values = np.concatenate([weight * (toward * n[j]).sum(1), -weight * (toward * n[i]).sum(1)])
     slopes = coo_matrix((values, (rows, np.concatenate([j, i]))), shape=(len(edge), len(x))).tocsr()
     matrix = slopes.T @ slopes + diags(np.full(len(x), length**-2))
-    scale = diags(1.0 / matrix.diagonal())
-    height, _ = cg(matrix, slopes.T @ wanted, rtol=TOLERANCE, maxiter=MAX_ITERATIONS, M=scale)
-    displacement = torch.from_numpy(height).to(mesh.vertices).clamp(-limit, limit)
+    displacement = torch.from_numpy(_solved(matrix, slopes.T @ wanted)).to(mesh.vertices).clamp(-limit, limit)
     vertices = mesh.vertices + displacement[:, None] * normals
     return replace(mesh, vertices=vertices, normals=vertex_normals(vertices, mesh.faces), tangents=None)
+
+
+def _solved(matrix: spmatrix, right: np.ndarray) -> np.ndarray:
+    """Conjugate gradients with the diagonal as preconditioner, the same for any number of threads; SciPy's are not,
+    because BLAS sums in an order that depends on it.
+    """
+    inverse = 1.0 / matrix.diagonal()
+    found, residual = np.zeros_like(right), right
+    direction = scaled = inverse * residual
+    error = first = (residual * scaled).sum()
+    for _ in range(MAX_ITERATIONS):
+        if error <= TOLERANCE**2 * first:
+            break
+        moved = matrix @ direction
+        step = error / (direction * moved).sum()
+        found, residual = found + step * direction, residual - step * moved
+        scaled = inverse * residual
+        before, error = error, (residual * scaled).sum()
+        direction = scaled + (error / before) * direction
+    return found

@@ -1,7 +1,6 @@
 """Float32 adjoints against float64 references, 99.9 % of the entries to 1e-4, and these against differences.
 
-Those of the estimator of light, of compositing and of light's lookups are in the tests of these operations; those of
-the surface and of triplanes in ``tests/geometry/test_geometry_fuzz.py``.
+Those of the estimator of light, of compositing and of light's lookups are in the tests of these operations.
 """
 
 from collections.abc import Callable
@@ -16,7 +15,8 @@ from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh, face_normals, vertex_normals
 from reli3d.geometry.regularize import vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
-from reli3d.geometry.surface import CubeWeights
+from reli3d.geometry.surface import CubeWeights, extract_surface
+from reli3d.geometry.triplane import sample_triplane
 from reli3d.render.asset import TextureSet
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.gbuffer import sample_texture, surface_points
@@ -24,10 +24,12 @@ from reli3d.render.material import sample_bsdf
 from reli3d.render.sampling import pdf_ggx_vndf
 from tests.support import op_cases, reference, reference_surface
 from tests.support.meshes import sheet
+from tests.support.reference import grid_samples
 from tests.support.reference_surface import random_weights, torus
 from tests.support.surfaces import on_ball
 
 F = torch.nn.functional
+ORDER = ("sdf", "deformation", "alpha", "beta")
 
 
 @dataclass
@@ -50,10 +52,58 @@ class Op:
         return [v.requires_grad_() for v in exact.values()]
 
 
+def triplane(g) -> Op:
+    batch, channels, height, width, count = 2, 40, 96, 128, 20_000
+    planes = torch.randn(batch, 3, channels, height, width, generator=g)
+    return Op(
+        {"planes": planes, "points": torch.rand(batch, count, 3, generator=g) * 2.1 - 1.05},
+        sample_triplane,
+        grid_samples,
+    )
+
+
 def surface_leaves(g):
     sdf = torus(40) + 0.02 * torch.randn(41, 41, 41, generator=g)
     sdf = F.pad(sdf, (1,) * 6, value=0.7)
     return {"sdf": sdf, **random_weights(sdf.shape, 3, spread=0.5)}
+
+
+def flexicubes(g) -> Op:
+    leaves = surface_leaves(g)
+    gamma = leaves.pop("gamma")
+
+    def ours(sdf, alpha, beta, deformation):
+        return extract_surface(sdf, radius=0.8, weights=CubeWeights(deformation, alpha, beta, gamma.to(sdf))).vertices
+
+    def in_float64(sdf, alpha, beta, deformation):
+        return reference_surface.flexicubes_vertices(sdf, deformation, alpha, beta, 1.6)[0]
+
+    return Op(leaves, ours, in_float64)
+
+
+def centers(g) -> Op:
+    """The vertices that split the quads, of dual vertices that stay."""
+    leaves = surface_leaves(g)
+    gamma = leaves.pop("gamma")
+    fields = CubeWeights(**{k: v for k, v in leaves.items() if k != "sdf"})
+    plain = extract_surface(leaves["sdf"], radius=0.8, weights=fields)
+    count = len(plain.vertices)
+
+    def ours(gamma):
+        near = {k: v.to(gamma) for k, v in leaves.items()}
+        weights = CubeWeights(near["deformation"], near["alpha"], near["beta"], gamma)
+        return extract_surface(near["sdf"], radius=0.8, weights=weights, center=True).vertices[count:]
+
+    def in_float64(gamma):
+        mesh = extract_surface(leaves["sdf"], radius=0.8, weights=fields, center=True)
+        quads = mesh.faces.long().view(-1, 4, 3)[:, :, 0]
+        cube = reference_surface.flexicubes_vertices(*(leaves[k] for k in ORDER), 1.6)[1]
+        corner, weight = mesh.vertices[:count].double()[quads], gamma[cube[quads]]
+        one, other = weight[:, 0] * weight[:, 2], weight[:, 1] * weight[:, 3]
+        weight = (one / (one + other))[:, None]
+        return 0.5 * (weight * (corner[:, 0] + corner[:, 2]) + (1 - weight) * (corner[:, 1] + corner[:, 3]))
+
+    return Op({"gamma": gamma}, ours, in_float64)
 
 
 def deviation(g) -> Op:
@@ -271,6 +321,9 @@ OPS = {
     **{
         f.__name__: f
         for f in (
+            triplane,
+            flexicubes,
+            centers,
             deviation,
             texture,
             normals,
@@ -287,8 +340,8 @@ OPS = {
 }
 
 
-# each axis of irradiance is a sum of 6000 terms, in any order
-ROUNDED_ON_CUDA = {("irradiance", "cuda"): 1e-3}
+# the reference of centers starts from vertices of the CPU; each axis of irradiance is a sum of 6000 terms, in any order
+ROUNDED_ON_CUDA = {("centers", "cuda"): 1e-3, ("irradiance", "cuda"): 1e-3}
 
 
 @pytest.mark.parametrize("name", OPS)

@@ -26,7 +26,7 @@ class WordJob:
 
     The words ``crash`` and ``crash once`` kill the process in the middle of the work, ``wait`` waits there for a file
       ``go``; ``refuse`` and ``fail`` are errors.  Their files are in ``folder``.  A ``crash`` waits for each ``crash
-      once`` before it, which would have a second crash else.
+      once`` before it, which would otherwise crash twice.
     """
 
     log: Path
