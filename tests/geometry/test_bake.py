@@ -141,6 +141,13 @@ def test_known_color_reads_back_through_the_file_at_every_mip(sphere, tmp_path):
         image = 0.25 * (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2])
 
 
+def test_constant_survives_every_mip_down_to_64(sphere):
+    image = bake(sphere, SIZE, lambda p, n: torch.full_like(p, 0.25))["value"].permute(2, 0, 1)[None]
+    while image.shape[-1] >= 64:
+        assert float(image.min()) == float(image.max()) == 0.25  # no texel was left black, so no mean mixes one in
+        image = torch.nn.functional.avg_pool2d(image, 2)
+
+
 def test_chunks_and_reused_texels_do_not_matter(sphere):
     texels = rasterize_texels(sphere, SIZE)
     one = bake(sphere, SIZE, lambda p, n: {"a": color(p), "b": n[:, :1]})

@@ -6,13 +6,16 @@ import signal
 import sys
 import tempfile
 import time
+from random import Random
 
 import pytest
 
+from reli3d.output.folder import claimed
 from tests import campaign
 from tests.support.readers import Target, targets
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs fork and /proc")
+NAMES = ("a", "b", "c")
 
 
 @pytest.fixture
@@ -101,3 +104,32 @@ def test_hostile_inputs_are_read_or_refused_in_one_line(tmp_path, small_threads,
     found = targets(tmp_path)
     ended = list(campaign.outcomes([campaign.drawn(found, 20, number) for number in range(count)]))
     assert len(ended) == count and [(o.name, o.fault) for o in ended if o.fault] == []
+
+
+@pytest.mark.parametrize("kills", [10, pytest.param(200, marks=pytest.mark.slow)])
+def test_kills_at_random_moments_leave_one_whole_result(tmp_path, kills):
+    """A process that exchanges results as fast as it can, killed at random moments."""
+    folder, rng, seen = tmp_path / "out" / "name", Random(7), set()
+    for k in range(kills):
+        pid = os.fork()
+        if pid == 0:
+            try:
+                for word in range(10**9):
+                    with claimed(folder, NAMES) as replacing, replacing() as new:
+                        for name in NAMES:
+                            (new / name).write_text(f"{os.getpid()} {word}")
+            finally:
+                os._exit(1)
+        while k % 2 and not (folder.exists() and (folder / NAMES[0]).read_text().startswith(f"{pid} ")):
+            time.sleep(0.001)  # until it wrote a result
+        time.sleep(rng.uniform(0.0, 0.05))
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+        if folder.exists():  # the state for other processes
+            assert len({(folder / name).read_text() for name in NAMES}) == 1
+        with claimed(folder, NAMES):  # the next start
+            words = {(folder / name).read_text() for name in NAMES} if folder.exists() else {"none"}
+        assert len(words) == 1
+        seen |= words
+        assert not folder.parent.exists() or {p.name for p in folder.parent.iterdir()} <= {"name"}
+    assert len(seen) >= kills // 2

@@ -80,6 +80,17 @@ def test_a_run_learns_logs_and_draws(folder, tmp_path):
     assert json.loads(state["about"]) == found[0]["config"] and state["measures"] == {"surface": 1.0}
 
 
+def test_stopped_and_continued_is_the_same_run(folder, whole, tmp_path, threads):
+    threads(1)
+    part, other = stage_of(folder), stage_of(folder, ball_model(7))
+    batch = part.batch
+    part.batch = lambda step, objects: batch(step, objects) if step < 3 else 1 / 0  # a checkpoint is of step 2
+    with pytest.raises(ZeroDivisionError):
+        train(part, options_of(part, tmp_path / "parts"))
+    train(other, options_of(other, tmp_path / "parts"))  # other parameters, which the checkpoint replaces
+    assert_same_run(whole, tmp_path / "parts")
+
+
 def test_two_parts_of_a_batch_add_up_to_the_whole(folder):
     """Gradients of the processes of a group, one after the other here: their mean is the gradient of one process."""
     grads = []
