@@ -1,8 +1,9 @@
 """Random hostile inputs: ``python -m tests.campaign --count 10000 --seed 0``.
 
-Every input is a good file with one to four changes drawn from its seed.  A forked process reads it, with limits on
-memory and time.  Allowed are a result, and ValueError and OSError of one line.  Failing inputs are saved.  The same
-seed gives the same inputs.  Runs on Linux.
+Every input is a good file with one to four changes drawn from its seed, or one that is made with its ground truth
+(``tests.support.known``).  A forked process reads it, with limits on memory and time.  Allowed are a result, the right
+one with known ground truth, and ValueError and OSError of one line.  Failing inputs are saved.  The same seed gives the
+same inputs.  Runs on Linux.
 """
 
 import argparse
@@ -44,25 +45,26 @@ class Outcome:
     fault: str
 
 
-def drawn(found: Sequence[Target], seed: int, number: int) -> tuple[Target, dict[str, bytes]]:
-    """Target and files of input ``number``."""
+def drawn(found: Sequence[Target], seed: int, number: int) -> tuple[Target, int, dict[str, bytes]]:
+    """Target, seed of its ground truth, and files of input ``number``."""
     rng = Random(f"{seed}/{number}")
     target = found[number % len(found)]
+    edits = [rng.getrandbits(63) for _ in range(1 if target.known else rng.choice((1, 1, 2, 4)))]
     files = target.files
-    for _ in range(rng.choice((1, 1, 2, 4))):
-        files = edited(files, rng.getrandbits(63))
-    return target, files
+    for edit in edits if not target.known else ():
+        files = edited(files, edit)
+    return target, edits[0], target.known(Random(edits[0])).files if target.known else files
 
 
-def outcomes(inputs: Sequence[tuple[Target, dict[str, bytes]]]) -> Iterator[Outcome]:
+def outcomes(inputs: Sequence[tuple[Target, int, dict[str, bytes]]]) -> Iterator[Outcome]:
     """Outcomes of ``inputs`` in their order; after one that ends its process the next has a new one."""
     pool, root = None, Path(tempfile.mkdtemp(prefix="campaign"))
 
     def read(number: int) -> str:
-        target, files = inputs[number]
-        return _fault(target.read, files, root)
+        target, seed, files = inputs[number]
+        return _fault(target.known(Random(seed)).read if target.known else target.read, files, root)
 
-    for number, (target, files) in enumerate(inputs):
+    for number, (target, _, files) in enumerate(inputs):
         pool = pool or ProcessPoolExecutor(1, get_context("fork"), initializer=_limited, initargs=(read,))
         try:
             fault = pool.submit(_read, number).result(WALL)

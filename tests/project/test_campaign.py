@@ -10,8 +10,15 @@ from random import Random
 
 import pytest
 
+from reli3d.io.glb import read_glb
+from reli3d.io.hdr import read_hdr_image
 from reli3d.output.folder import claimed
+from reli3d.views.folder import load_views
+from reli3d.views.views import Views
 from tests import campaign
+from tests.support import known
+from tests.support.known import KINDS
+from tests.support.misread import Misread
 from tests.support.readers import Target, targets
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs fork and /proc")
@@ -25,7 +32,7 @@ def small_threads(threads):
 
 def fault_of(read, before=lambda folder: None) -> str:
     """Of the second of two inputs, of which the first is read by ``before``."""
-    inputs = [(Target("planted", {"a.txt": b"one"}, r), {"a.txt": b"one"}) for r in (before, read)]
+    inputs = [(Target("planted", {"a.txt": b"one"}, r), 0, {"a.txt": b"one"}) for r in (before, read)]
     return [o.fault for o in campaign.outcomes(inputs)][1]
 
 
@@ -95,8 +102,8 @@ def test_good_files_are_accepted(tmp_path, small_threads):
 
         return only
 
-    found = [dataclasses.replace(t, read=accepted(t.read)) for t in targets(tmp_path)]
-    assert [o.fault for o in campaign.outcomes([(t, t.files) for t in found])] == [""] * len(found)
+    found = [dataclasses.replace(t, read=accepted(t.read)) for t in targets(tmp_path) if not t.known]
+    assert [o.fault for o in campaign.outcomes([(t, 0, t.files) for t in found])] == [""] * len(found)
 
 
 @pytest.mark.parametrize("count", [140, pytest.param(10_000, marks=pytest.mark.slow)])
@@ -104,6 +111,30 @@ def test_hostile_inputs_are_read_or_refused_in_one_line(tmp_path, small_threads,
     found = targets(tmp_path)
     ended = list(campaign.outcomes([campaign.drawn(found, 20, number) for number in range(count)]))
     assert len(ended) == count and [(o.name, o.fault) for o in ended if o.fault] == []
+
+
+def test_an_input_read_as_another_fails(tmp_path, small_threads, monkeypatch):
+    """The campaign's own power: a reader whose masks are half transparent, and one that refuses nothing."""
+    cases = {name: [make(Random(seed)) for seed in range(12)] for name, make in KINDS.items()}
+    monkeypatch.setattr(known, "load_views", lambda folder, **options: faded(load_views(folder, **options)))
+    monkeypatch.setattr(known, "read_hdr_image", lambda path, **options: 2 * read_hdr_image(path, **options))
+    monkeypatch.setattr(known, "read_glb", lambda path, **options: 2 * read_glb(path, **options))
+    for name, some in cases.items():
+        kinds = set()
+        for k, case in enumerate(some):
+            folder = tmp_path / f"{name}-{k}"
+            campaign.write(folder, case.files)
+            try:
+                case.read(folder)
+                kinds.add("right")
+            except (Misread, ValueError, OSError) as error:
+                kinds.add(type(error).__name__)
+        assert "Misread" in kinds and "right" not in kinds, name
+
+
+def faded(views: Views) -> Views:
+    masks = tuple(mask / 2 for mask in views.masks)
+    return dataclasses.replace(views, masks=masks, c2w=views.c2w.roll(1, 0))
 
 
 @pytest.mark.parametrize("kills", [10, pytest.param(200, marks=pytest.mark.slow)])

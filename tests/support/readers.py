@@ -4,6 +4,7 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from random import Random
 
 import numpy as np
 import torch
@@ -21,16 +22,19 @@ from reli3d.synthetic.maps import load_maps
 from reli3d.views.check import explain_cameras
 from reli3d.views.folder import load_views
 from tests.support import hostile, hostile_maps
+from tests.support.known import KINDS
+from tests.support.misread import Case
 from tests.support.scenes import ball_mesh, textures
 
 
 @dataclass(frozen=True)
 class Target:
-    """files: by their names in the folder that ``read`` is called with."""
+    """files: by their names in the folder that ``read`` is called with.  known: makes one with ground truth."""
 
     name: str
     files: dict[str, bytes]
     read: Callable[[Path], object]
+    known: Callable[[Random], Case] | None = None
 
 
 def _folder(make: Callable[[Path], object], root: Path) -> dict[str, bytes]:
@@ -76,7 +80,7 @@ def targets(root: Path) -> list[Target]:
     asset = Asset(ball_mesh(1, 0.6), textures(4, torch.device("cpu")))
     maps = io.BytesIO()
     np.savez(maps, env=np.ones((2, 4, 8, 3), np.float32), names=["a", "b"])
-    return found + [
+    found += [
         Target("hdr", {"a.hdr": environment_bytes(radiance)}, lambda f: read_environment(f / "a.hdr")),
         Target("exr", {"a.exr": hostile_maps.exr_bytes()}, lambda f: read_environment(f / "a.exr")),
         Target("glb", {"a.glb": glb_bytes(asset)}, lambda f: read_glb(f / "a.glb")),
@@ -84,6 +88,11 @@ def targets(root: Path) -> list[Target]:
         Target("maps", {"a.npz": maps.getvalue()}, lambda f: load_maps(f / "a.npz")),
         Target("list", {"a.txt": b"one\ntwo/three\n"}, lambda f: listed(f / "a.txt")),
     ]
+    return found + [Target(name, {}, _nothing, make) for name, make in KINDS.items()]
+
+
+def _nothing(folder: Path) -> None:
+    """A target with ground truth reads by itself."""
 
 
 def _with_images(folder: Path) -> None:
