@@ -1,4 +1,9 @@
-"""Displacement of a mesh along its normals so that its surface has given normals."""
+"""Displacement of a mesh along its normals so that its surface has given normals.
+
+The displacements h minimize the sum over the edges of all faces of ``(t . (d + change of h n))^2 / |d|^2`` plus the sum
+over the vertices of ``(h / length)^2``, where d is an edge, n the normal at its ends and t the mean target there.
+Source: Nehab et al. 2005, Efficiently combining positions and normals for precise 3D geometry.
+"""
 
 from dataclasses import replace
 
@@ -14,17 +19,13 @@ TOLERANCE, MAX_ITERATIONS = 1e-3, 200  # of conjugate gradients: preconditioned 
 
 
 def displace_to_normals(mesh: Mesh, target: Tensor, *, length: float, limit: Tensor) -> Mesh:
-    """``mesh`` with every vertex displaced along its normal, so that the surface's normals approach ``target (V, 3)``.
+    """``mesh`` with vertices displaced along their normals so that the surface's normals approach ``target (V, 3)``.
 
-    mesh: with normals; its triangles have no edges of length 0.  target: unit normals at the vertices.  length: world
-    units; features smaller than about ``length`` follow the target, larger ones keep their positions.  limit: ``(V,)``,
-    greatest displacement to either side, at least 0.  The displacements h minimize the sum over the edges of all faces
-    of ``(t . (d + change of h n))^2 / |d|^2`` plus the sum over the vertices of ``(h / length)^2``, where d is an edge,
-    n the normal at its ends and t the mean of the target there.  No gradient; computed on the CPU.  Returns the mesh
-    with new normals, without tangents.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or a length
-    that is not positive.
-
-    Source: Nehab et al. 2005, Efficiently combining positions and normals for precise 3D geometry.
+    mesh: with normals.  target: unit normals at the vertices.  length: world units; features smaller than about
+    ``length`` follow the target, larger ones keep their positions.  limit: ``(V,)``, greatest displacement to either
+    side, at least 0.  Returns the mesh with new normals, without tangents.  No gradient; computed on the CPU.  Raises
+    TypeError for a wrong dtype, ValueError for a wrong shape or a length that is not positive.  Source: Nehab et al.
+    2005.
     """
     normals = present("mesh.normals", mesh.normals)
     check("target", target, shape=mesh.vertices.shape, like=mesh.vertices)
@@ -49,8 +50,9 @@ def displace_to_normals(mesh: Mesh, target: Tensor, *, length: float, limit: Ten
 
 
 def _solved(matrix: spmatrix, right: np.ndarray) -> np.ndarray:
-    """Conjugate gradients with the diagonal as preconditioner, the same for any number of threads; SciPy's are not,
-    because BLAS sums in an order that depends on it.
+    """Solution of ``matrix x = right`` by conjugate gradients, preconditioned with the diagonal.
+
+    The result does not depend on the number of threads; that of SciPy's solver does, through sums in BLAS.
     """
     inverse = 1.0 / matrix.diagonal()
     found, residual = np.zeros_like(right), right
