@@ -141,16 +141,24 @@ def _corner_weights(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, 
     return mesh.faces[texels.face.reshape(-1)[index].long()].long(), weight[..., None]
 
 
+def _interpolated(values: Tensor, corner: Tensor, weight: Tensor) -> Tensor:
+    """``(N, C)``, corner by corner: the values of all three would need the most memory of a reconstruction."""
+    mean = values[corner[:, 0]] * weight[:, 0]
+    for k in (1, 2):
+        mean += values[corner[:, k]] * weight[:, k]
+    return mean
+
+
 def _unit(values: Tensor, corner: Tensor, weight: Tensor) -> Tensor:
     """Interpolated unit vectors ``(N, 3)``; those of vertex 0 where they cancel."""
-    mean = (values[corner] * weight).sum(1)
+    mean = _interpolated(values, corner, weight)
     none = mean.square().sum(1, keepdim=True) < 1e-12
     return torch.nn.functional.normalize(torch.where(none, values[corner[:, 0]], mean), dim=1)
 
 
 def _positions_normals(mesh: Mesh, corner: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
-    return (mesh.vertices.detach()[corner] * weight).sum(1), _unit(normals.detach(), corner, weight)
+    return _interpolated(mesh.vertices.detach(), corner, weight), _unit(normals.detach(), corner, weight)
 
 
 def _tangents(mesh: Mesh, corner: Tensor, weight: Tensor) -> Tensor:
@@ -204,7 +212,7 @@ def bake(
             if tangents:
                 arguments = (*arguments, _tangents(mesh, corner, weight))
             if values is not None:
-                arguments = (*arguments, (values.detach()[corner] * weight).sum(1))
+                arguments = (*arguments, _interpolated(values.detach(), corner, weight))
             found = fn(*arguments)
             found = {"value": found} if isinstance(found, Tensor) else found
             if maps and found.keys() != maps.keys():
