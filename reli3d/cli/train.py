@@ -213,7 +213,7 @@ def paper_stage(args: argparse.Namespace) -> "Stage":
     from reli3d.train.stages import config
     from reli3d.train.stages.latents import fitted, load_prior
     from reli3d.train.stages.sources import source
-    from reli3d.train.stages.stage import PaperStage
+    from reli3d.train.stages.stage import PaperOptions, PaperStage
     from reli3d.train.stages.views import Samples
 
     preset, stages = (OFFICIAL, config.PAPER) if getattr(args, "preset", "") == "official" else (TINY, config.TINY)
@@ -238,15 +238,11 @@ def paper_stage(args: argparse.Namespace) -> "Stage":
             if isinstance(samples, Samples):
                 cache = args.output / f"{folder.name}.latents"
                 samples.latents = fitted(model.environment, samples.files, cache, progress=report)
-    names = ("seed", "max_views", "bfloat16", "checkpointing")
+    names = ("max_views", "bfloat16", "checkpointing")
+    options = PaperOptions(distance=getattr(args, "perceptual", "gradients"), **given(args, *names))
+    folders = [str(folder) for folder in args.data]
     return PaperStage(
-        model.to(device),
-        one,
-        sources,
-        distance=getattr(args, "perceptual", "gradients"),
-        validation=held_out,
-        folders=[str(folder) for folder in args.data],
-        **given(args, *names),
+        model.to(device), one, sources, options, validation=held_out, folders=folders, **given(args, "seed")
     )
 
 

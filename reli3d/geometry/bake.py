@@ -186,7 +186,7 @@ def bake(
     texels: from :func:`~reli3d.geometry.bake.rasterize_texels`.  tangents: also pass ``(N, 4)``.  values: vertex
     attributes ``(V, C)``, interpolated, passed last.  fill: copy the nearest covered texel to uncovered ones.
 
-    Raises TypeError for a wrong type or dtype, ValueError without ``uv`` or covered texels, or for wrong results.
+    Raises TypeError for a wrong type, ValueError without ``uv`` or covered texels, or for wrong results.
 
     >>> maps = reli3d.bake(mesh, 64, lambda position, normal: 0.5 + 0.5 * normal)
     >>> textures = reli3d.TextureSet(maps["value"], roughness=0.5, metallic=0.0)

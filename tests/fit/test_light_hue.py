@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from reli3d.fit import refine as fit
 from reli3d.fit.light_hue import CHROMATICITY_WEIGHT, MAX_FACTOR, with_neutral_light
 from reli3d.render.environment import Environment
 from tests.support import small_scene
@@ -39,3 +40,17 @@ def test_gray_and_black_lighting_stay_the_same_and_strong_colors_change_by_a_lim
     start = replace(small_scene.ball(), environment=lit([1.0, 0.0, 0.0]))
     ratio = with_neutral_light(start).textures.base_color / start.textures.base_color
     assert float(ratio.max()) <= MAX_FACTOR + 1e-5 and float(ratio.min()) >= 1.0 / MAX_FACTOR - 1e-5
+
+
+def test_a_fit_starts_from_the_lighting_of_the_given_chromaticity():
+    true = replace(small_scene.ball(), environment=lit([1.2, 1.0, 0.8]))
+    views = small_scene.input_views(true, 3, 24)
+    start = replace(true, environment=Environment(0.7 * true.light.radiance))
+    slopes = []
+    for weight in (0.0, 0.5, 1.0):
+        options = fit.RefineOptions(16, light_chromaticity=weight)
+        result = fit.refine(start, views, steps=3, options=options)
+        assert result.changed
+        got, given = (a.light.radiance.mean((0, 1)).log() for a in (result.asset, start))
+        slopes.append(float((got[0] - got[2]) / (given[0] - given[2])))
+    assert slopes == pytest.approx([0.0, 0.5, 1.0], abs=0.1)  # three steps hardly change the lighting

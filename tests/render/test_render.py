@@ -109,12 +109,16 @@ def test_texture_on_a_square_is_upright_and_resolved(device):
     assert float(render_asset(asset, wide, env).radiance[:, 0].abs().max()) == 0.0
 
 
-def test_bands_and_supersampling_do_not_change_the_mean(device, monkeypatch):
+def test_bands_bound_the_rays_in_memory_and_supersampling_keeps_the_mean(device, monkeypatch):
     asset, env = ball(device), Environment(torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(1)).to(device))
     camera = Camera.from_fov(eye(device, 0.5, 1.0, 2.0), 0.8, 40, 40)
     whole = render_asset(asset, camera, env)
-    monkeypatch.setattr("reli3d.render.image.BAND_RAYS", 200)
-    banded = render_asset(asset, camera, env)
+    rays, closest = [], RayScene.closest
+    with monkeypatch.context() as patch:
+        patch.setattr("reli3d.render.image.BAND_RAYS", 200)
+        patch.setattr(RayScene, "closest", lambda self, *args: rays.append(len(args[0])) or closest(self, *args))
+        banded = render_asset(asset, camera, env)
+    assert len(rays) == 8 and max(rays) <= 200  # five rows of 40 pixels at a time
     torch.testing.assert_close(banded.radiance, whole.radiance, rtol=1e-4, atol=1e-4)  # ray origins round differently
     fine = render_asset(asset, camera, env, supersampling=3)
     inside = whole.alpha > 0

@@ -1,7 +1,7 @@
 """The training stages of the ReLi3D paper's network."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,26 @@ VALIDATION_OBJECTS = 3  # validation objects in the image
 TILE_PIXELS = 96  # pixels of a side of a tile of the image
 
 
+@dataclass(frozen=True)
+class PaperOptions:
+    """Options of :class:`PaperStage`.
+
+    max_views: upper limit of the random number of input views; the first is the reference view.  background: fraction
+    of the objects whose input includes the background.  distance: ``gradients`` or ``lpips``, the perceptual term.
+    bfloat16: autocast of the trunk.  checkpointing: recompute the trunk's layers in the backward pass.
+    """
+
+    max_views: int = 4
+    background: float = 0.5
+    distance: str = "gradients"
+    bfloat16: bool = False
+    checkpointing: bool = False
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.max_views <= 16:
+            raise ValueError(f"max_views: expected 1 to 16, got {self.max_views}")
+
+
 class PaperStage(Stage):
     """Compares held-out views with renderings of the predicted object."""
 
@@ -32,39 +52,21 @@ class PaperStage(Stage):
         model: Reconstructor,
         config: StageConfig,
         sources: Sequence[Source],
+        options: PaperOptions = PaperOptions(),  # noqa: B008 # it is frozen
         *,
         seed: int = 0,
-        max_views: int = 4,
-        background: float = 0.5,
-        distance: str = "gradients",
-        bfloat16: bool = False,
-        checkpointing: bool = False,
         validation: Source | None = None,
         folders: Sequence[str] = (),
     ):
-        """max_views: upper limit of the random number of input views; the first is the reference view.  background:
-        fraction of the objects whose input includes the background.  distance: ``gradients`` or ``lpips``, the
-        perceptual term.  bfloat16: autocast of the trunk.  checkpointing: recompute the trunk's layers in the backward
-        pass.  validation: held-out objects.  folders: names of the sources for the log.
-        """
-        if not 1 <= max_views <= 16:
-            raise ValueError(f"max_views: expected 1 to 16, got {max_views}")
+        """validation: held-out objects.  folders: names of the sources for the log."""
         self.name, self.weights = config.name, vars(config.weights)
         self.settings = {"steps": config.steps, "batch": config.batch, "rate": config.rate}
         self.settings |= {"final_rate": 0.1, "weight_decay": 0.01, "clip": 1.0}
         self.model, self.config, self.sources = model, config, sources
-        self.seed, self.max_views, self.background, self.bfloat16 = seed, max_views, background, bfloat16
-        self.distance = perceptual(distance)
-        self._numbers = {
-            "config": asdict(config),
-            "folders": list(folders),
-            "max_views": max_views,
-            "background": background,
-            "distance": distance,
-            "bfloat16": bfloat16,
-            "checkpointing": checkpointing,
-        }
-        if checkpointing:
+        self.seed, self.max_views, self.background = seed, options.max_views, options.background
+        self.bfloat16, self.distance = options.bfloat16, perceptual(options.distance)
+        self._numbers = {"config": asdict(config), "folders": list(folders), **asdict(options)}
+        if options.checkpointing:
             checkpointed(model)
         held_out = [validation] * VALIDATION_OBJECTS if validation else []
         self.held_out = [self.drawn(0, k, [source], patch=0) for k, source in enumerate(held_out)]
