@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from reli3d.geometry.camera import project
+from reli3d.geometry.camera import Camera, project
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.output import preview
@@ -61,12 +61,13 @@ def test_the_sheet_holds_the_inputs_unseen_views_maps_and_a_small_light(asset):
 
 
 def test_the_filter_takes_noise_and_leaves_edges(asset):
-    """Against 500 samples a subpixel; a checkered ball, so that blur of the base color shows."""
+    """Against 500 samples a subpixel; a checkered ball, so that blur of the base color shows; a quarter of the tile."""
     checks = torch.where(((torch.arange(32)[:, None] // 4 + torch.arange(32) // 4) % 2 == 0)[..., None], 0.8, 0.1)
     maps = replace(textures(32, "cpu"), base_color=checks.expand(-1, -1, 3).contiguous())
     checkered = replace(asset, textures=maps)
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-    camera = preview.unseen_cameras(asset.mesh, rig((0, 15, 3), target=(2.0, 2.0, 2.0)))[0]
+    tile = preview.unseen_cameras(asset.mesh, rig((0, 15, 3), target=(2.0, 2.0, 2.0)))[0]
+    camera = Camera(tile.c2w, tile.intrinsics, tile.width // 2, tile.height // 2)
     few, many = (
         render_asset(checkered, camera, options=ShadeOptions(samples=samples), supersampling=2, scene=scene)
         for samples in (preview.SUBPIXEL_SAMPLES, (400, 80, 20))

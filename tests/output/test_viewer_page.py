@@ -28,7 +28,7 @@ from reli3d.views.views import Views
 from tests.support.browser import chromium, pixels
 from tests.support.scenes import ball_mesh, textures
 
-SIZE, WIDE = 256, 320  # the page's window is wider than the photographs
+SIZE, WIDE = 192, 336  # the page's window is wider than the photographs
 EYES = ((0.9, 0.6, 2.0), (-2.0, 0.5, -0.6))
 # Minimum PSNR of each lighting.  On a ball, which has no self-occlusion, the limit is three.js' light prefiltered by
 # roughness, whose lobes are narrower than GGX: a ball half of rough metal reaches 24.9.
@@ -69,7 +69,7 @@ def views() -> Views:
     up, zero = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
     c2w = torch.stack([look_at(torch.tensor(eye), zero, up) for eye in EYES])
     image, mask = torch.tensor([0.0, 0.0, 1.0]).expand(SIZE, SIZE, 3).contiguous(), torch.ones(SIZE, SIZE)
-    intrinsics = torch.tensor([[300.0, 290.0, 140.0, 120.0]] * 2)
+    intrinsics = torch.tensor([[225.0, 217.5, 105.0, 90.0]] * 2)
     return Views((image,) * 2, (mask,) * 2, c2w, intrinsics, ("front </script>.png", "back.png"))
 
 
