@@ -76,7 +76,7 @@ def test_the_mesh_follows_the_frame_of_the_cameras(tmp_path):
     matrix[:3, :3] *= 7.0
     matrix[:3, 3] = torch.tensor([30.0, -4.0, 11.0])
     folder = moved_example(tmp_path / "moved", matrix)
-    assert command(tmp_path, infer.EXAMPLE, folder, "--normalize", "hull") == 0
+    assert command(tmp_path, infer.EXAMPLE, folder, "--normalize", "hull", "--views", "4") == 0
     here, there = (read_glb(tmp_path / "out" / n / "mesh.glb")[0].mesh.vertices.double() for n in ("example", "moved"))
     box = torch.stack([here.amin(0), here.amax(0)]) * 7 + matrix[:3, 3]
     got = torch.stack([there.amin(0), there.amax(0)])
@@ -165,7 +165,7 @@ def test_json_is_one_object_on_stdout(tmp_path, capsys):
     assert example["result"] == "done" and not example["suspect"] and example["verdict"].startswith("cameras agree")
     assert len(example["lines"]) == 12 and Path(example["image"]).is_file()
     assert empty["result"] == "refused" and "expected transforms.json" in empty["notes"][0]
-    assert command(tmp_path, *folders, "--json") == 1
+    assert command(tmp_path, *folders, "--json", "--views", "2") == 1
     made = json.loads(capsys.readouterr().out)["objects"]
     assert [o["result"] for o in made] == ["done", "refused"] and made[0]["faces"] > 1000
     assert (Path(made[0]["folder"]) / "mesh.glb").is_file()

@@ -18,7 +18,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from tests.support import small_scene
 
-VIEWS, SIZE = 6, 48
+VIEWS, SIZE = 6, 36
 STAGE = maps.MapsStage("maps", until=1.0)
 
 

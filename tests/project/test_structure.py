@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import functools
 import graphlib
 import importlib
 import re
@@ -37,6 +38,7 @@ def name_of(path: Path, base: Path = ROOT) -> str:
 MODULES = {name_of(path) for path in SOURCES}
 
 
+@functools.cache
 def imports(source: str, module: str, is_package: bool) -> list[str]:
     """Every module that ``source`` imports, at the top or inside functions, with relative names made absolute.
 
