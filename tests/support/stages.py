@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
+from reli3d.cli.samples import SampleJob, SampleSpec
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
@@ -50,6 +51,15 @@ def rows(run: Path) -> list[dict]:
 def numbers(run: Path) -> list[dict]:
     """Rows of the log without the configuration and the time."""
     return [{k: v for k, v in row.items() if k != "seconds"} for row in rows(run) if "config" not in row]
+
+
+def rendered_sample(folder: Path, spec: SampleSpec, seed: int = 0) -> Path:
+    """A sample as ``reli3d-data render`` makes it, without the process of a worker."""
+    threads, name = torch.get_num_threads(), f"{seed:010d}"
+    folder.mkdir(exist_ok=True)
+    SampleJob(spec).run(None, name, folder / f"{name}.safetensors")
+    torch.set_num_threads(threads)
+    return folder / f"{name}.safetensors"
 
 
 def write_samples(folder: Path, seeds=SEEDS, views: int = 4, size: int = 48) -> Path:

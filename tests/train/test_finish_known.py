@@ -10,6 +10,7 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from reli3d.cli.data import main as data
+from reli3d.cli.samples import SampleSpec
 from reli3d.cli.train import main, small_network
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.presets import SMALL
@@ -18,6 +19,7 @@ from reli3d.train.batches import load_sample
 from reli3d.train.losses import losses, pixel_losses
 from reli3d.train.pixels import Group, read_views_reduced
 from reli3d.train.stages.views import Samples
+from tests.support.stages import rendered_sample
 
 FINISH = {"roughness", "metallic"}
 
@@ -33,7 +35,8 @@ def scans(tmp_path_factory):
         Image.new("RGB", (32, 32), (128, 128, 128)).save(root / "sets" / "one" / f"{name}.png")
     call = ["--maps", str(root / "maps.npz"), "--meshes", str(root / "box.glb"), "--count", "1", "--views", "2"]
     call += ["--size", "32", "--workers", "1"]
-    assert data(["render", str(root / "plain"), *call]) == 0
+    spec = SampleSpec(root / "maps.npz", False, False, views=2, size=32, meshes=(root / "box.glb",), shapes=())
+    rendered_sample(root / "plain", spec)
     assert data(["render", str(root / "refinished"), *call, "--materials", str(root / "sets")]) == 0
     return root
 

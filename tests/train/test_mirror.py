@@ -5,13 +5,14 @@ import pytest
 import torch
 import trimesh
 
-from reli3d.cli.data import main as data
+from reli3d.cli.samples import SampleSpec
 from reli3d.geometry.camera import project
 from reli3d.nn.weights import load_model
 from reli3d.train import batches
 from reli3d.train.batches import load_sample
 from reli3d.train.losses import losses
 from reli3d.train.mirror import mirrored_visibility, surface_mirror
+from tests.support.stages import rendered_sample
 
 ANGLE, OFFSET = 0.7, 0.13  # of the plane
 
@@ -60,9 +61,8 @@ def box(tmp_path_factory):
     root = tmp_path_factory.mktemp("box")
     np.savez(root / "maps.npz", env=np.ones((6, 8, 16, 3), np.float32), names=[f"m{k}" for k in range(6)])
     trimesh.creation.box((1.0, 0.7, 0.4)).export(root / "box.glb")
-    call = ["--maps", str(root / "maps.npz"), "--meshes", str(root / "box.glb"), "--count", "1", "--views", "2"]
-    assert data(["render", str(root / "out"), *call, "--size", "64", "--workers", "1"]) == 0
-    return root / "out" / "0000000000.safetensors"
+    spec = SampleSpec(root / "maps.npz", False, False, views=2, size=64, meshes=(root / "box.glb",), shapes=())
+    return rendered_sample(root / "out", spec)
 
 
 def test_mirror_images_show_the_points_that_they_are_said_to_show(box, monkeypatch):
