@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from reli3d.capture import fusion
 from reli3d.capture.fusion import fused_masks
 from reli3d.capture.mapping import Map, View
 from reli3d.capture.photos import Photo
@@ -85,3 +86,30 @@ def test_masks_of_a_pixel_leave_no_colors_and_are_accepted():
     for mask in masks.values():
         mask[mask.shape[0] // 2, mask.shape[1] // 2] = 255
     assert {k: v.shape for k, v in fused_masks(found, scene, masks).items()} == {k: v.shape for k, v in masks.items()}
+
+
+def test_texels_that_enough_views_show_outside_the_masks_have_the_colors_of_the_plane():
+    """Two low parts, missing in the cover: the first is in the masks of 6 of 10 views, the other in those of 7."""
+    plane, part, radius, at = 100, 200, 0.15, ((-0.4, 0.0), (0.4, 0.0))
+    scene = Scene(np.zeros(3), 2.4, Plane(np.array([0.0, 0, 1]), 0.0), np.zeros(0, bool), np.zeros(0, bool))
+    axes = fusion._Axes(np.zeros(3), scene.plane.axes)
+    smalls, inside, cover = [], [], []
+    for k in range(10):
+        azimuth = 2 * np.pi * k / 10
+        camera = view(k, 2.4 * np.array([np.cos(azimuth), np.sin(azimuth), 1.0]) / np.sqrt(2))
+        w, h = camera.photo.size
+        y, x = np.mgrid[:h, :w] + 0.5
+        rays = camera.rays(np.stack([x, y], -1).reshape(-1, 2))
+        shown = (camera.eye - camera.eye[2] / rays[:, 2:] * rays)[:, :2]  # of the plane z = 0
+        low = np.zeros(h * w, bool)
+        for place, views in zip(at, (6, 7), strict=True):
+            low |= (np.linalg.norm(shown - place, axis=1) < radius) & (k < views)
+        image = np.repeat(np.where(low, part, plane).astype(np.uint8).reshape(h, w, 1), 3, 2)
+        smalls.append(fusion._Small(camera, image, 1.0))
+        inside.append(low.reshape(h, w))
+        cover.append(np.zeros((h, w), bool))
+    texture = fusion._plane_texture(smalls, inside, cover, axes, scene)
+    index = np.array([[*place, 0.0] for place in at]) @ axes.axes[:2].T / texture.cell + len(texture.color) / 2
+    first, other = (texture.color[v, u] for u, v in index.astype(int))
+    assert np.abs(first - plane).max() < 1  # 4 views show it outside the masks; the median of all shows the part
+    assert np.abs(other - part).max() < 1  # only 3: all are taken
