@@ -40,6 +40,7 @@ SAME_UP = math.cos(math.radians(15.0))  # between the upward directions of views
 OUTLIER_AGREEMENT = 0.8  # of the median: a view whose mask the hull fills less is left out
 SIDE_ELEVATION = 45.0  # degrees up to which a direction looks at a side of the object
 LEAST_REGISTERED, MOST_ERROR, WIDEST_GAP = 0.8, 1.0, 60.0
+SMALL_STEPS = "take sharp images of one object in small steps around it"
 LEAST_POINTS, LEAST_AGREEMENT, LEAST_MASK, LEAST_FIT = 200, 0.85, 0.03, 0.8
 
 
@@ -69,6 +70,7 @@ class CaptureReport:
     gap: float = 0.0  # degrees, the widest between cameras around the object
     agreement: float = 0.0  # median fraction of a mask that the visual hull fills
     epipolar_fit: float = 1.0  # matches on the object that fit the cameras, over those that fit pairs of views
+    surroundings_fit: float = 1.0  # the same of the matches around it, in the first map
     mask_fraction: float = 0.0  # median fraction of an image that the mask covers
     mask_method: str = ""
     plane: bool = False
@@ -123,13 +125,18 @@ def capture(
     scene = find_scene(first)
     segmented = _Segmented(first, _masks(first, scene, known, None, progress))
     if len(segmented.masks) < FEWEST:
+        enough = len(first.views) >= LEAST_REGISTERED * len(photos)
         raise InputError(
             source,
             f"expected an object that stands out in at least {FEWEST} images, got {len(segmented.masks)} of "
-            f"{len(photos)} ({len(first.views)} registered); give --masks, or take sharper images nearer to it",
+            f"{len(photos)} ({len(first.views)} registered); "
+            + ("give --masks, or take sharper images nearer to it" if enough else SMALL_STEPS),
         )
+    report.surroundings_fit = epipolar_fit(first, segmented.masks, inside=False)
+    if region is None and report.surroundings_fit < RIGID_FIT:
+        segmented, scene = _without_moving(segmented, scene, known, report, progress)
     final, up, ground = _refined(segmented, scene, known, report, progress)
-    report.epipolar_fit = round(report.epipolar_fit, 3)
+    report.epipolar_fit, report.surroundings_fit = round(report.epipolar_fit, 3), round(report.surroundings_fit, 3)
     report.registered = len(final.found.views)
     registered = {v.photo.name for v in final.found.views}
     report.lost = [p.name for p in photos if p.name not in registered]
@@ -235,6 +242,48 @@ def _masks(
             masks[view.photo.name] = mask
     progress("masks", len(found.views), len(found.views))
     return masks
+
+
+def _without_moving(
+    segmented: _Segmented, scene: Scene, known: dict | None, report: CaptureReport, progress: Progress
+) -> tuple[_Segmented, Scene]:
+    """The map with its masks, and the scene, of features inside the masks and on the support alone.
+
+    Unchanged where the object itself was moved, and where these features are too few.
+    """
+    first, masks = segmented.found, segmented.masks
+    if epipolar_fit(first, masks) < RIGID_FIT:
+        return segmented, scene
+    regions = [_still_region(v, first.points[scene.support], masks.get(v.photo.name)) for v in first.views]
+    try:
+        second = map_photos([v.photo for v in first.views], progress, regions)
+    except InputError:
+        second = None
+    if second and len(second.views) >= KEPT_FRACTION * len(first.views) and epipolar_fit(second, masks) >= RIGID_FIT:
+        again = find_scene(second)
+        renewed = _masks(second, again, known, None, progress)
+        if len(renewed) >= KEPT_FRACTION * len(masks):
+            report.notes.append(
+                "matches around the object do not fit the cameras, as where something moves: "
+                "features of the object and its support are used"
+            )
+            return _Segmented(second, renewed), again
+    if report.surroundings_fit < LEAST_FIT:
+        report.failed.append(
+            f"{100 * report.surroundings_fit:.0f} % of the matches around the object fit the cameras, at least 80 % "
+            "expected: something moves there"
+        )
+    return segmented, scene
+
+
+def _still_region(view: View, support: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """``(H, W)`` uint8, 255 inside the mask and at the points ``support (N, 3)``."""
+    width, height = view.photo.size
+    pixels, depth = view.project(support)
+    x, y = pixels[(depth > 0) & ((pixels >= 0) & (pixels < (width, height))).all(1)].astype(int).T
+    region = np.zeros((height, width), np.uint8) if mask is None else mask.copy()
+    region[y, x] = 255
+    return region
 
 
 def _refined(
@@ -368,7 +417,7 @@ def _whole_views(source: Path, final: _Segmented, report: CaptureReport) -> list
         if any("border" in reason for reason in report.left_out.values()):
             fix = "step back: the whole object must be in the image"
         elif report.registered < LEAST_REGISTERED * report.images:
-            fix = "take sharp images of one object in small steps around it"
+            fix = SMALL_STEPS
         raise InputError(
             source,
             f"expected at least {FEWEST} views that show the whole object, got {len(views)} of {report.images} images "
@@ -455,7 +504,7 @@ def _check(report: CaptureReport) -> None:
             f"the object covers {100 * report.mask_fraction:.1f} % of an image, at least 3 % expected",
         ),
     )
-    report.failed = [text for passed, text in checks if not passed]
+    report.failed += [text for passed, text in checks if not passed]
 
 
 def _write(output: Path, views, masks, frame: Frame, box: np.ndarray, report: CaptureReport, points, progress) -> None:

@@ -1,4 +1,4 @@
-"""Objects that were moved between views: epipolar fit of matches, and groups of views with one rigid motion."""
+"""Objects and surroundings that move between views: epipolar fit of matches, groups of views with one rigid motion."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from reli3d.capture import capture as function
 from reli3d.capture.mapping import Map, View
 from reli3d.capture.rigidity import Group, epipolar_fit, rigid_groups
+from reli3d.capture.scene import Scene
+from reli3d.errors import InputError
 from tests.support.mapped import SIZE, view
 
 
@@ -44,6 +47,42 @@ def test_matches_on_a_moved_object_do_not_fit_the_cameras(moved):
     passes = [Group(1.0, np.eye(3), np.zeros(3), tuple(str(k) for k in part)) for part in (range(6), range(6, 12))]
     between = epipolar_fit(found, masks, between=passes)
     assert between < 0.5 if moved else between > 0.97
+
+
+def test_what_moves_around_the_object_is_left_out_of_a_second_map(monkeypatch):
+    """80 points move with the camera, 40 are on the object and 40 on its support."""
+    rng = np.random.default_rng(0)
+    views, points = ring(), rng.uniform(-0.3, 0.3, (80, 3))
+    points[40:] = points[40:] * (2, 2, 0.02) - (0, 0, 0.4)
+    corner, shown, masks = rng.uniform(5, 85, (80, 2)), [], {}
+    for v in views:
+        still = v.project(points)[0]
+        mask = np.zeros(SIZE[::-1], np.uint8)
+        cv2.fillConvexPoly(mask, np.rint(cv2.convexHull(still[:40].astype(np.float32))).astype(np.int32), 255)
+        masks[v.photo.name] = cv2.dilate(mask, np.ones((5, 5), np.uint8))
+        shown.append(np.concatenate([still, corner]))
+    matches = [tuple((a, b, shown[a][:n], shown[b][:n]) for b in range(12) for a in range(b)) for n in (160, 80)]
+    first, second = (Map(tuple(views), points, np.zeros(80), np.full(80, 3), m) for m in matches)
+    on_object = np.arange(80) < 40
+    scene = Scene(np.zeros(3), 3.0, None, on_object, ~on_object)
+    regions: list[np.ndarray] = []
+
+    def mapped(photos, progress, masks):
+        regions.extend(masks)
+        if len(regions) > len(views):
+            raise InputError("photographs", "expected images that overlap")
+        return second
+
+    monkeypatch.setattr(function, "map_photos", mapped)
+    for expected, failed in ((second, 0), (first, 1)):
+        report = function.CaptureReport(12, surroundings_fit=epipolar_fit(first, masks, inside=False))
+        assert report.surroundings_fit < 0.8 and epipolar_fit(first, masks) > 0.97
+        segmented = function._Segmented(first, masks)
+        result, _ = function._without_moving(segmented, scene, masks, report, lambda *_: None)
+        assert result.found is expected and len(report.failed) == failed and len(report.notes) == 1 - failed
+    for region, pixels in zip(regions, shown, strict=False):
+        found = region[tuple(pixels.astype(int).T[::-1])] > 0
+        assert found[:80].all() and not found[80:].any()
 
 
 def test_groups_of_views_have_the_motions_of_the_object():

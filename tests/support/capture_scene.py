@@ -75,6 +75,19 @@ def scene_surface(seed: int, table_yaw: float = 0.0, table: float = TABLE) -> tu
     return ObjectSurface(whole), len(shape.faces)
 
 
+def board(azimuth: float, origins, directions, depth) -> tuple[torch.Tensor, torch.Tensor]:
+    """Which rays ``(N, 3)`` hit an upright board nearer than ``depth (N,)``, and the colors of its pattern there."""
+    outward = torch.tensor([np.sin(azimuth), 0.0, np.cos(azimuth)], dtype=torch.float32)
+    along = (1.1 - origins @ outward) / (directions @ outward)
+    at = origins + along[:, None] * directions
+    across = at @ torch.stack([outward[2], outward[1], -outward[0]])
+    place = torch.stack([across / 0.5, at[:, 1] / 1.3], -1)
+    front = (along > 0) & (along < depth) & (place.abs() < 1).all(-1)
+    pattern = torch.rand(1, 3, 60, 24, generator=torch.Generator().manual_seed(8))
+    shown = torch.nn.functional.grid_sample(pattern, place[front][None, None], align_corners=False)
+    return front, shown[0, :, 0].T
+
+
 def render_capture(
     seed: int = 3,
     views: int = 20,
@@ -82,11 +95,12 @@ def render_capture(
     *,
     moved_after: int | None = None,
     turntable: bool = False,
+    passerby: bool = False,
 ) -> TrueCapture:
     """A ring of hand-held views at two heights under a sky; cameras are relative to the object.
 
     moved_after: from this view on the object is elsewhere on the table.  turntable: the camera is fixed, the object
-    turns with a small table in front of a textured background.
+    turns with a small table in front of a textured background.  passerby: something upright moves behind the table.
     """
     rng = np.random.default_rng(0)
     width, height = size
@@ -109,7 +123,7 @@ def render_capture(
     pooled = torch.nn.functional.avg_pool2d
     for k in range(views):
         yaw = 0.6 if moved_after is not None and k >= moved_after else 0.0
-        surface, faces = scene_surface(seed, yaw, 0.7 if turntable else TABLE)
+        surface, faces = scene_surface(seed, yaw, 0.7 if turntable else 1.0 if passerby else TABLE)
         environment = sky.rotated(float(azimuth[k])) if turntable else sky
         at = (torch.tensor(v, dtype=torch.float32) for v in (eye[k], target[k], roll[k] + (0, 1, 0)))
         pose = look_at(*at)
@@ -122,6 +136,9 @@ def render_capture(
         image[seen] = shade(
             points, -directions[seen], environment, scene=surface.scene, options=ShadeOptions(samples=samples, seed=k)
         )
+        if passerby:
+            front, color = board(float(azimuth[k] + np.pi + 0.4 * np.sin(1.9 * k)), origins, directions, hits.t)
+            image[front] = color
         on_object = (hits.face >= 0) & (hits.face < faces)
         image = pooled(image.reshape(1, 2 * height, 2 * width, 3).permute(0, 3, 1, 2), 2)[0].permute(1, 2, 0)
         covered = pooled(on_object.float().reshape(1, 2 * height, 2 * width), 2)[0] > 0.5
