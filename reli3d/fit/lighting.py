@@ -48,10 +48,6 @@ class Lights:
             return [[view] for view in range(len(self.group))]
         return [[v for v, g in enumerate(self.group) if g == k] for k in dict.fromkeys(self.group)]
 
-    def scaled(self, factor: float) -> Lights:
-        """The same lights times ``factor``."""
-        return Lights(factor * self.maps, self.group, self.c2w)
-
     def evaluate(
         self,
         points: SurfacePoints,

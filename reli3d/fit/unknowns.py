@@ -7,7 +7,6 @@ metallic; logarithms of radiance): zero is the start, and every value is valid.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -73,14 +72,6 @@ class Unknowns:
         """Sets the bend of all normals to zero."""
         for grid in self.bend:
             grid.zero_()
-
-    def clone(self) -> Unknowns:
-        """A deep copy, detached."""
-        copy: dict[str, Any] = {
-            name: [t.detach().clone() for t in value] if isinstance(value, list) else value.detach().clone()
-            for name, value in vars(self).items()
-        }
-        return Unknowns(**copy)
 
 
 @dataclass(frozen=True)
