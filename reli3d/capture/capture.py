@@ -70,7 +70,7 @@ class CaptureReport:
     gap: float = 0.0  # degrees, the widest between cameras around the object
     agreement: float = 0.0  # median fraction of a mask that the visual hull fills
     epipolar_fit: float = 1.0  # matches on the object that fit the cameras, over those that fit pairs of views
-    surroundings_fit: float = 1.0  # the same of the matches around it, in the first map
+    surroundings_fit: float = 1.0  # the same around it; of the first map, where the object was moved
     mask_fraction: float = 0.0  # median fraction of an image that the mask covers
     mask_method: str = ""
     plane: bool = False
@@ -267,6 +267,7 @@ def _without_moving(
                 "matches around the object do not fit the cameras, as where something moves: "
                 "features of the object and its support are used"
             )
+            report.surroundings_fit = epipolar_fit(second, renewed, inside=False)
             return _Segmented(second, renewed), again
     if report.surroundings_fit < LEAST_FIT:
         report.failed.append(
@@ -306,7 +307,7 @@ def _refined(
     if report.epipolar_fit >= RIGID_FIT and consistent:
         return segmented, up, ground
     views, by_name = segmented.views, {v.photo.name: v for v in first.views}
-    lenses = first if epipolar_fit(first, segmented.masks, inside=False) >= RIGID_FIT else None
+    lenses = first if report.surroundings_fit >= RIGID_FIT else None
     try:
         second = map_photos([v.photo for v in views], progress, [segmented.masks[v.photo.name] for v in views], lenses)
     except InputError:
