@@ -18,7 +18,7 @@ from reli3d.nn.presets import OFFICIAL, SMALL, TINY
 from reli3d.nn.weights import load_model
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.latlong import lat_long_directions
-from reli3d.train import checkpoint
+from reli3d.train import checkpoint, small
 from reli3d.train.batches import draw_samples, load_sample, random_turn
 from reli3d.train.light_prior import LightPriorStage
 from reli3d.train.loop import parameter_groups, progress, rate_at, train
@@ -215,6 +215,18 @@ def test_training_learns_logs_and_resumes(folder, tmp_path):
     again = SmallStage(LocalReconstructor(SMALL), [folder], seed=3, points=256, max_views=1)
     train(again, dataclasses.replace(options, steps=14))
     assert checkpoint.load(tmp_path / "state.pt")["step"] == 14
+
+
+def test_the_image_of_a_run_shows_a_sample_from_one_and_from_four_views(folder, monkeypatch):
+    monkeypatch.setattr(small, "VALIDATION_OBJECTS", 1)
+    monkeypatch.setattr("reli3d.output.preview.TILE_PIXELS", 64)
+    stage = SmallStage(load_model("small", "cpu"), [folder], validation=folder)
+    image = stage.validation(stage.model.state_dict())
+    one, four = np.split(image, 2, axis=1)
+    assert image.dtype == np.uint8 and one.shape == (*four.shape[:2], 3)
+    tile = one.shape[1] // 4
+    assert np.array_equal(one[:tile], four[:tile]) and not np.array_equal(one, four)  # both begin with the input views
+    assert SmallStage(stage.model, [folder]).validation(stage.model.state_dict()) is None
 
 
 def test_a_new_stage_is_a_subclass_with_its_terms(folder, tmp_path):
