@@ -198,6 +198,7 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
         pairing.overlap, pairing.quadratic_overlap = 15, True  # offsets of 1 to 15, 16, 32, ...: these close loops
         pycolmap.match_sequential(database, pairing_options=pairing, verification_options=verification)
     options = pycolmap.IncrementalPipelineOptions(min_model_size=3, random_seed=SEED, extract_colors=False)
+    options.num_threads = 1  # else the first pair of images depends on the threads, where few pairs are good
     if known:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
