@@ -132,7 +132,7 @@ def small_stage(args: argparse.Namespace) -> "Stage":
     from reli3d.nn.value_bins import with_bins
     from reli3d.synthetic.stored import check_samples
     from reli3d.train.pixels import reduced_model
-    from reli3d.train.small import PixelStage, SmallStage
+    from reli3d.train.small import PixelStage, SmallOptions, SmallStage
 
     pixels = args.stage == "pixels"
     calibrated = CALIBRATED_VIEWS + 1  # views of a sample for calibration: one is compared
@@ -154,9 +154,9 @@ def small_stage(args: argparse.Namespace) -> "Stage":
         model = with_bins(model, args.material_bins)
     finest = SIDES[::-1].index(side) if pixels else 0
     model = reduced_model(model, finest).train() if finest else model
-    names = ("seed", "max_views", "points", "pyramid_rate", "bfloat16", "maps", "validation")
+    options = SmallOptions(**given(args, "max_views", "points", "pyramid_rate", "bfloat16"))
     make = PixelStage if pixels else SmallStage
-    return make(model.to(device_of(args)), args.data, **given(args, *names))
+    return make(model.to(device_of(args)), args.data, options, **given(args, "seed", "maps", "validation"))
 
 
 def device_of(args: argparse.Namespace) -> str:

@@ -11,6 +11,7 @@ from typing import overload
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding_bag, normalize
 
 from reli3d import _bridge
 from reli3d._bridge import check, expect, struct_of
@@ -135,25 +136,22 @@ def _checked_corners(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor,
 
 
 def _corner_weights(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
-    """Vertices ``(N, 3)`` of the faces at the texels of ``index``, and their weights ``(N, 3, 1)``."""
+    """Vertices of the faces at the texels of ``index`` and their weights, both ``(N, 3)``."""
     bary = texels.bary.reshape(-1, 2)[index]
     weight = torch.cat([1.0 - bary.sum(1, keepdim=True), bary], 1)
-    return mesh.faces[texels.face.reshape(-1)[index].long()].long(), weight[..., None]
+    return mesh.faces[texels.face.reshape(-1)[index].long()].long(), weight
 
 
 def _interpolated(values: Tensor, corner: Tensor, weight: Tensor) -> Tensor:
-    """``(N, C)``, corner by corner: the values of all three would need the most memory of a reconstruction."""
-    mean = values[corner[:, 0]] * weight[:, 0]
-    for k in (1, 2):
-        mean += values[corner[:, k]] * weight[:, k]
-    return mean
+    """``values (V, C)`` at the texels, ``(N, C)``."""
+    return embedding_bag(corner, values, per_sample_weights=weight, mode="sum")
 
 
 def _unit(values: Tensor, corner: Tensor, weight: Tensor) -> Tensor:
     """Interpolated unit vectors ``(N, 3)``; those of vertex 0 where they cancel."""
     mean = _interpolated(values, corner, weight)
     none = mean.square().sum(1, keepdim=True) < 1e-12
-    return torch.nn.functional.normalize(torch.where(none, values[corner[:, 0]], mean), dim=1)
+    return normalize(torch.where(none, values[corner[:, 0]], mean), dim=1)
 
 
 def _positions_normals(mesh: Mesh, corner: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,11 +1,11 @@
 """FlexiCubes isosurface extraction (Shen et al. 2023, Flexible Isosurface Extraction, SIGGRAPH).
 
 A grid of X * Y * Z cubes fills the box [-radius, radius]^3.  Grid vertices ``(X + 1, Y + 1, Z + 1)`` and cubes ``(X, Y,
-Z)`` are in C order (z fastest).  Corners of a cube are numbered x + 2y + 4z for x, y, z in {0, 1}; edges as in
+Z)`` are in C order.  Corners of a cube are numbered x + 2y + 4z for x, y, z in {0, 1}; edges as in
 ``kernels.flexicubes_tables.EDGES``.  Vertices and faces are in the order of the authors' code, bitwise identical for
-any number of threads; faces are counter-clockwise seen from the positive side.  A positive field gives
-an empty mesh, a negative one the box if ``closed``.  Not implemented: the tetrahedra of the paper's section 4.5, and
-dual vertices placed by the field's gradient.
+any number of threads; faces are counter-clockwise seen from the positive side.  A positive field gives an empty mesh, a
+negative one the box if ``closed``.  Not implemented: the paper's tetrahedra, and dual vertices placed by the field's
+gradient.
 """
 
 from collections.abc import Sequence

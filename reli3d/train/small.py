@@ -1,6 +1,7 @@
 """The training stages of the small network: ``pixels`` trains the 2D U-Net alone, ``small`` the whole network."""
 
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,21 @@ VALIDATION_OBJECTS = 3  # validation objects in the image, reconstructed from on
 LIST_EVERY = 50  # steps after which the folders are listed again: samples may be added during training
 
 
+@dataclass(frozen=True)
+class SmallOptions:
+    """Options of :class:`SmallStage`.
+
+    max_views: upper limit of the random number of input views.  points: volume points per object; half as many surface
+    points.  pyramid_rate: multiplier of the learning rate of the 2D U-Net, which small batches degrade at the full
+    rate.  bfloat16: compute dtype of the convolutions.
+    """
+
+    max_views: int = 6
+    points: int = 2048
+    pyramid_rate: float = 1.0
+    bfloat16: bool = False
+
+
 class SmallStage(Stage):
     """The whole network, on points, pixels and lighting of the samples in ``folders``."""
 
@@ -41,36 +57,27 @@ class SmallStage(Stage):
         self,
         model: LocalReconstructor,
         folders: Sequence[Path],
+        options: SmallOptions = SmallOptions(),  # noqa: B008 # it is frozen
         *,
         seed: int = 0,
-        max_views: int = 6,
-        points: int = 2048,
-        pyramid_rate: float = 1.0,
-        bfloat16: bool = False,
         maps: Path | None = None,
         validation: Path | None = None,
     ):
-        """folders: of ``*.safetensors`` from ``reli3d-data``.  max_views: upper limit of the random number of input
-        views.  points: volume points per object; half as many surface points.  pyramid_rate: multiplier of the
-        learning rate of the 2D U-Net, which small batches degrade at the full rate.  bfloat16: compute dtype of the
-        convolutions.  maps: environment maps, .npz, for relighting samples.  validation: folder of held-out samples.
-        Samples are loaded to the device of ``model``.
+        """folders: of ``*.safetensors`` from ``reli3d-data``.  maps: environment maps, .npz, for relighting samples.
+        validation: folder of held-out samples.  Samples are loaded to the device of ``model``.
         """
         self.model, self.folders, self.seed = model, tuple(folders), seed
-        self.max_views, self.points, self.pyramid_rate = max_views, points, pyramid_rate
+        self.max_views, self.points, self.pyramid_rate = options.max_views, options.points, options.pyramid_rate
         self.lights = training_maps(maps) if maps else None
         self.held_out = sorted(validation.glob("*.safetensors"))[:VALIDATION_OBJECTS] if validation else []
         self._files: list[Path] = []
         self._numbers = {
             "folders": [str(f) for f in folders],
-            "max_views": max_views,
-            "points": points,
-            "pyramid_rate": pyramid_rate,
-            "bfloat16": bfloat16,
+            **asdict(options),
             "maps": str(maps or ""),
             "validation": str(validation or ""),
         }
-        model.to_compute(torch.bfloat16 if bfloat16 else torch.float32)
+        model.to_compute(torch.bfloat16 if options.bfloat16 else torch.float32)
 
     def files(self, step: int) -> list[Path]:
         """Files that ``step`` draws from.  Raises InputError if there are none."""
@@ -124,9 +131,9 @@ class PixelStage(SmallStage):
     name = "pixels"
     weights = {term: WEIGHTS[term] for term in PIXEL_TERMS}
 
-    def __init__(self, model: LocalReconstructor, folders: Sequence[Path], **options: Any):
-        super().__init__(model, folders, **options)
-        self._cache = ViewCache(model.pyramid.finest, model.device)
+    def __init__(self, *args: Any, **options: Any):
+        super().__init__(*args, **options)
+        self._cache = ViewCache(self.model.pyramid.finest, self.model.device)
 
     def batch(self, step: int, objects: range) -> Sequence[Any]:
         """A single item with all objects: convolutions of small images are faster in large batches."""

@@ -32,7 +32,7 @@ from reli3d.train.losses import (
     pattern_loss,
     perturbed,
 )
-from reli3d.train.small import LAST_RATE, PixelStage, SmallStage
+from reli3d.train.small import LAST_RATE, PixelStage, SmallOptions, SmallStage
 from reli3d.train.stage import Options
 from reli3d.train.stages.latents import load_prior
 
@@ -159,7 +159,7 @@ def test_turns_are_rotations():
 
 
 def test_a_batch_is_a_function_of_seed_step_and_places_however_it_is_shared(folder):
-    stage = SmallStage(LocalReconstructor(SMALL), [folder], seed=7, points=256, max_views=2)
+    stage = SmallStage(LocalReconstructor(SMALL), [folder], SmallOptions(2, 256), seed=7)
     whole = stage.batch(2, range(4))
     torch.manual_seed(0)
     shared = [stage.batch(2, range(rank, 4, 2)) for rank in range(2)]
@@ -195,14 +195,14 @@ def test_every_parameter_is_in_one_group_and_last_layers_learn_faster():
     for p in model.parameters():
         assert times[id(p)] == (LAST_RATE if id(p) in fast else 1.0, 0.02 if p.ndim > 1 else 0.0)
     slow = {id(p) for name, p in model.pyramid.named_parameters() if not name.startswith("features")}
-    for group in parameter_groups(SmallStage(model, [], pyramid_rate=0.1), 0.02):
+    for group in parameter_groups(SmallStage(model, [], SmallOptions(pyramid_rate=0.1)), 0.02):
         for p in group["params"]:
             assert group["times"] == pytest.approx(times[id(p)][0] * (0.1 if id(p) in slow else 1.0))
 
 
 def test_training_learns_logs_and_resumes(folder, tmp_path):
     torch.manual_seed(0)
-    stage = SmallStage(LocalReconstructor(SMALL), [folder], seed=3, points=256, max_views=1)
+    stage = SmallStage(LocalReconstructor(SMALL), [folder], SmallOptions(1, 256), seed=3)
     options = stage.options(str(tmp_path), steps=12, batch=1, warmup=5, seed=3)
     (sample,) = drawn(folder, (3,), points=256, max_views=1)
     before = losses(stage.model, sample)
@@ -212,7 +212,7 @@ def test_training_learns_logs_and_resumes(folder, tmp_path):
     after = losses(stage.model, sample)
     whole = [float(sum(WEIGHTS[k] * v for k, v in terms.items())) for terms in (before, after)]
     assert whole[1] < 0.7 * whole[0]  # 12 steps on two objects
-    again = SmallStage(LocalReconstructor(SMALL), [folder], seed=3, points=256, max_views=1)
+    again = SmallStage(LocalReconstructor(SMALL), [folder], SmallOptions(1, 256), seed=3)
     train(again, dataclasses.replace(options, steps=14))
     assert checkpoint.load(tmp_path / "state.pt")["step"] == 14
 
@@ -240,7 +240,7 @@ def test_a_new_stage_is_a_subclass_with_its_terms(folder, tmp_path):
         def rate_factor(self, parameter):
             return 1.0 if parameter.startswith("light.") else 0.0
 
-    stage = Brightness(LocalReconstructor(SMALL), [folder], points=64, max_views=1)
+    stage = Brightness(LocalReconstructor(SMALL), [folder], SmallOptions(1, 64))
     before = {k: v.clone() for k, v in stage.model.state_dict().items()}
     train(stage, stage.options(str(tmp_path), steps=2, batch=1))
     changed = {k for k, v in stage.model.state_dict().items() if not torch.equal(v, before[k])}
@@ -249,7 +249,7 @@ def test_a_new_stage_is_a_subclass_with_its_terms(folder, tmp_path):
 
 def test_a_checkpoint_of_version_0_2_gives_its_weights_and_resumes(folder, tmp_path):
     """Those files hold model, optimizer, average, step and seconds alone."""
-    stage = SmallStage(LocalReconstructor(SMALL), [folder], points=64, max_views=1)
+    stage = SmallStage(LocalReconstructor(SMALL), [folder], SmallOptions(1, 64))
     train(stage, stage.options(str(tmp_path), steps=1, batch=1))
     path = tmp_path / "state.pt"
     state = torch.load(path, weights_only=True)
