@@ -144,7 +144,7 @@ def _corner_weights(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, 
 
 def _interpolated(values: Tensor, corner: Tensor, weight: Tensor) -> Tensor:
     """``values (V, C)`` at the texels, ``(N, C)``."""
-    return embedding_bag(corner, values, per_sample_weights=weight, mode="sum")
+    return embedding_bag(corner, values.contiguous(), per_sample_weights=weight, mode="sum")  # bits depend on strides
 
 
 def _unit(values: Tensor, corner: Tensor, weight: Tensor) -> Tensor:
