@@ -23,7 +23,7 @@ from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 from reli3d.synthetic.procedural import ProceduralObject, sample_cameras
 
-SAMPLES = (16, 12, 4)  # light, GGX and cosine samples per pixel: the noise is a photograph's
+SAMPLES = (4, 3, 1)  # light, GGX and cosine samples per ray; with FINE**2 rays per pixel the noise is a photograph's
 FINE = 2  # rays along each side of a pixel
 DIFFUSE_MODEL = "published"  # the training data of the bundled weights, and the formula of glTF viewers
 EXPOSURE_TARGET = 0.6  # linear value of the 90th percentile of the object in the first view
@@ -84,18 +84,14 @@ class ObjectSurface:
         return SurfacePoints(position, ng, *map(as_float, (bump, base, rough, metal)))
 
 
-def _render(surface: Surface, camera: Camera, light: Environment, seed: int, fine: int):
-    """Radiance ``(fine**2 H W, 3)`` of all rays; of the rays that hit: indices, points, view directions and radiance.
-
-    fine: rays along each side of a pixel.
-    """
-    origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera.scaled(fine)))
+def _render(surface: Surface, camera: Camera, light: Environment, seed: int):
+    """Radiance ``(H * W, 3)`` of all rays; of the rays that hit: indices, points, view directions and radiance."""
+    origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
     hits = surface.scene.closest(origins, directions)
     seen = (hits.face >= 0).nonzero()[:, 0]
     points = surface.points_at(hits.face[seen].long(), hits.bary[seen])
     wo = -directions[seen]
-    of_light, of_lobe, of_cosine = (n // fine**2 for n in SAMPLES)
-    options = ShadeOptions(samples=(of_light, of_lobe, of_cosine), seed=seed, diffuse_model=DIFFUSE_MODEL)
+    options = ShadeOptions(samples=SAMPLES, seed=seed, diffuse_model=DIFFUSE_MODEL)
     radiance = shade(points, wo, light, scene=surface.scene, options=options)
     image = light.lookup(directions)
     image[seen] = radiance
@@ -138,7 +134,7 @@ def render_sample(
     maps: dict[str, list[Tensor]] = {"view_material": [], "view_normal": [], "view_depth": []}
     for k in range(views):
         seed = int(rng.integers(1 << 30))
-        image, seen, points, wo, radiance = _render(surface, cameras[k], environment, seed, fine)
+        image, seen, points, wo, radiance = _render(surface, cameras[k].scaled(fine), environment, seed)
         if k == 0:
             bright = max(float(radiance.mean(-1).quantile(0.9)), 1e-3)
             exposure = EXPOSURE_TARGET / bright * float(np.exp(rng.normal(0, 0.25)))
