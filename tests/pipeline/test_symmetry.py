@@ -5,7 +5,6 @@ from dataclasses import fields, replace
 import pytest
 import torch
 import trimesh
-from torch.nn import functional
 
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.rays import RayScene
@@ -15,7 +14,6 @@ from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import load_model
 from reli3d.pipeline import ReconstructOptions, Stopwatch, encode, reconstruct
 from reli3d.prepare import completed, prepare
-from reli3d.render.color import linear_to_srgb
 from reli3d.views.normalize import normalize
 from reli3d.views.views import Views
 from tests.support.meshes import mesh_from
@@ -23,7 +21,6 @@ from tests.support.reference_surface import grid
 
 SIZE = 192
 BALLS = [((0.0, 0.0, 0.0), 0.3), ((0.35, 0.1, 0.25), 0.14), ((-0.35, 0.1, 0.25), 0.14), ((0.0, 0.3, -0.2), 0.14)]
-LAMP = (0.3, 0.8, 0.5)
 EYES = [(0.3, 0.9, 2.4), (2.3, 0.4, -0.8), (1.9, 1.2, 1.4), (0.2, -0.3, -2.2)]  # hardly any sees the left half
 
 
@@ -36,26 +33,20 @@ def depth_in_balls(points):
 
 @pytest.fixture(scope="module")
 def views():
-    """Lambertian balls under radiance 0.8 + 0.75 w . LAMP in direction w: 0.8 + 0.5 n . LAMP times the base color."""
     c2w = torch.stack([look_at(eye) for eye in EYES])
     camera = Camera.from_fov(c2w, 0.6, SIZE, SIZE)
+    origin, direction = camera_rays(camera)
     masks, images = [], []
-    for origin, direction in zip(*camera_rays(camera)):
-        clear, depth = torch.full((SIZE, SIZE), -1.0), torch.full((SIZE, SIZE), torch.inf)
-        normal = torch.zeros(SIZE, SIZE, 3)
+    for o, d in zip(origin, direction):
+        nearest, shade = torch.full((SIZE, SIZE), -1.0), torch.full((SIZE, SIZE), 0.5)
         for center, radius in BALLS:
-            to_center = torch.tensor(center) - origin
-            along = (to_center * direction).sum(-1)
-            away = (to_center - along[..., None] * direction).norm(dim=-1)
-            clear = torch.maximum(clear, (radius - away) * camera.intrinsics[0, 0] / along)
-            t = along - (radius**2 - away**2).clamp(min=0).sqrt()
-            nearer = (away < 1.02 * radius) & (t < depth)  # also pixels whose centers lie just outside
-            depth = torch.where(nearer, t, depth)
-            outward = functional.normalize(t[..., None] * direction - to_center, dim=-1)
-            normal = torch.where(nearer[..., None], outward, normal)
-        shading = 0.8 + 0.5 * (normal @ functional.normalize(torch.tensor(LAMP), dim=0))
-        masks.append((clear + 0.5).clamp(0, 1))
-        images.append(linear_to_srgb((shading[..., None] * torch.tensor([0.75, 0.25, 0.1])).clamp(0, 1)))
+            along = ((torch.tensor(center) - o) * d).sum(-1)
+            away = (torch.tensor(center) - o - along[..., None] * d).norm(dim=-1)
+            clear = (radius - away) * camera.intrinsics[0, 0] / along
+            shade = torch.where(clear > nearest, 0.4 + 0.5 * (1 - away / radius).clamp(0, 1), shade)
+            nearest = torch.maximum(nearest, clear)
+        masks.append((nearest + 0.5).clamp(0, 1))
+        images.append(shade[..., None] * torch.tensor([0.9, 0.5, 0.3]))
     return Views(tuple(images), tuple(masks), c2w, camera.intrinsics, tuple("abcd"))
 
 
