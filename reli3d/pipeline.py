@@ -46,7 +46,7 @@ from reli3d.views.folder import load_views
 from reli3d.views.normalize import FAR_DISTANCES, normalize
 from reli3d.views.published_views import BACKGROUNDS, background_shown, hero_first, placement_notes
 from reli3d.views.similarity import Similarity, output_frame
-from reli3d.views.views import Views
+from reli3d.views.views import ViewBatch, Views
 
 if TYPE_CHECKING:
     from reli3d.fit.refine import Refinement
@@ -421,24 +421,17 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     >>> views = reli3d.load_views("photos/shoe", every=True)
     >>> asset = reli3d.refine(reli3d.reconstruct(views.taken()), views, seconds=60)
     """
-    return refined(asset, views, seconds=seconds, steps=steps, **options).asset
+    options = {"light": views.lighting, **options}
+    batch = views.to(asset.mesh.vertices.device).resampled(REFINED)
+    return _refined(asset, batch, seconds=seconds, steps=steps, **options).asset
 
 
-@full_precision
-def refined(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, bar: bool = False,
-            interrupt: Callable[[], bool] | None = None, **options) -> Refinement:  # fmt: skip
-    """As :func:`refine`; returns the asset and the record of the fit.
-
-    bar, interrupt: see :func:`reli3d.fit.refine.refine`.
-    """
+def _refined(asset: Asset, batch: ViewBatch, *, seconds: float | None = None, steps: int | None = None,
+             bar: bool = False, interrupt: Callable[[], bool] | None = None, **options) -> Refinement:  # fmt: skip
     from reli3d.fit import refine as fit  # imported where it is used: it loads kernels of its own
 
-    device = asset.mesh.vertices.device
-    chosen = fit.RefineOptions(**{"light": views.lighting, **options})
-    views_on_device = views.to(device).resampled(REFINED)
-    return fit.refine(
-        asset, views_on_device, seconds=seconds, steps=steps, options=chosen, bar=bar, interrupt=interrupt
-    )
+    chosen = fit.RefineOptions(**options)
+    return fit.refine(asset, batch, seconds=seconds, steps=steps, options=chosen, bar=bar, interrupt=interrupt)
 
 
 class Progress:
@@ -515,7 +508,12 @@ def reconstruct_folder(
     with watch.stage("reading"):
         whole = published_input(model.preset) or options.background != "masked"
         photographs = reading.read(folder, whole=whole)
-    views = photographs.taken()
+        views, batch = photographs.taken(), None
+        fit: dict[str, Any] = {}
+        if reading.budget:
+            batch = photographs.resampled(REFINED)
+            fit = {"light": reading.lighting(photographs), "cameras": reading.cameras, **reading.budget}
+        del photographs  # 1 GB of 60 images of 1 MP
     if options.up == "y" and (axis := up_axis(views.c2w)) not in (None, "y"):
         views = replace(views, notes=(*views.notes, f"the cameras suggest {axis} as the up axis: try --up {axis}"))
     progress.report(views.notes)
@@ -528,16 +526,14 @@ def reconstruct_folder(
     progress.report(watch.notes)
     output = placed.output_from_input
     shown, compared, first, record = views.transformed(output), None, None, {}
-    if reading.budget:
+    if batch is not None:
         with watch.stage("refine"):
-            photographs = photographs.transformed(output)
-            fit: dict[str, Any] = {"cameras": reading.cameras, "interrupt": reading.interrupt, **reading.budget}
-            fit["light"] = reading.lighting(photographs)
-            result = refined(asset, photographs, bar=True, **fit)
+            batch = replace(batch, c2w=output.of_cameras(batch.c2w)).to(model.device)
+            result = _refined(asset, batch, bar=True, interrupt=reading.interrupt, **fit)
             compared = comparison(asset, result.asset, shown.to(model.device))
         progress.report(result.notes)
         first, asset = asset if result.changed else None, result.asset
-        record = {"refinement": {"views": len(photographs), **reading.budget, **result.record()}}
+        record = {"refinement": {"views": len(batch), **(reading.budget or {}), **result.record()}}
     with watch.stage("preview"):
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
         frames, moved = results.frame_record(placed.model_from_input, output, views.origin, options.up)

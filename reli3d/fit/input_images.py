@@ -90,7 +90,10 @@ class InputImages:
                 raise ValueError(f"light: expected the lighting of {count} views, got {len(group)}")
         elif light not in ("object", "camera"):
             raise ValueError(f"light: expected object, camera or a name for each view, got {light!r}")
-        return cls(srgb_to_linear(images.detach()), masks.detach(), camera, group, light == "camera")
+        linear = torch.empty_like(images)
+        for into, image in zip(linear, images.detach(), strict=True):  # one at a time: less memory
+            into.copy_(srgb_to_linear(image))
+        return cls(linear, masks.detach(), camera, group, light == "camera")
 
     def __len__(self) -> int:
         return len(self.color)
@@ -109,8 +112,10 @@ class InputImages:
         """The images resampled to ``size`` pixels per side; colors are averaged with the masks as weights."""
         if size == self.size:
             return self
-        planes = torch.cat([self.color * self.mask[..., None], self.mask[..., None]], -1).permute(0, 3, 1, 2)
-        planes = interpolate(planes, (size, size), mode="bilinear", align_corners=False, antialias=True)
+        planes = self.color.new_empty(len(self), 4, size, size)
+        for into, color, mask in zip(planes, self.color, self.mask, strict=True):  # one at a time: less memory
+            of_view = torch.cat([color * mask[..., None], mask[..., None]], -1).permute(2, 0, 1)[None]
+            into.copy_(interpolate(of_view, (size, size), mode="bilinear", align_corners=False, antialias=True)[0])
         cover = planes[:, 3]
         color = planes[:, :3].permute(0, 2, 3, 1) / cover.clamp(min=1e-4)[..., None]
         camera = self.camera.resized(size, size)

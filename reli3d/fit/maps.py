@@ -25,6 +25,7 @@ from reli3d.render.points import SurfacePoints
 PIXELS_PER_STEP = 6144
 SHADING_SAMPLES = ((6, 6, 2), (12, 12, 4))  # of light, BSDF and cosine, in the first and the second half of a stage
 MAX_PIXELS = 400_000  # of all images: 46 MB; of more, a random subset
+SPARE = 1.5  # times MAX_PIXELS are traced, as some rays miss the surface
 LEARNING_RATES = {"material": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
 GRID_INTERVAL = 0.1  # of a stage's progress, after which the next finer map or grid is optimized as well
 DETAIL_FROM = 0.35  # progress from which the texture detail is optimized
@@ -79,9 +80,13 @@ def traced(data: FixedSurface, scene: RayScene, seed: int) -> Pixels:
     """
     asset, images = data.asset, data.images
     inside, mesh, parts = images.inside(), asset.mesh, []
+    rng = torch.Generator().manual_seed(seed)
+    share = SPARE * MAX_PIXELS / max(int(inside[data.used].sum()), 1)  # of the pixels whose points are computed
     for view in data.used:
         hits, _, directions = primary_hits(scene, images.camera[view])
         both = inside[view] & (hits.face >= 0)
+        if share < 1.0:
+            both &= (torch.rand(both.shape, generator=rng, dtype=torch.float32, device="cpu") < share).to(both.device)
         face, bary = hits.face[both], hits.bary[both]
         at = surface_points(mesh, asset.textures, face, bary)
         uv = interpolate(present("mesh.uv", mesh.uv), mesh.faces, face, bary)
@@ -100,7 +105,6 @@ def traced(data: FixedSurface, scene: RayScene, seed: int) -> Pixels:
             )
         )
     columns = [torch.cat(column) for column in zip(*parts)]
-    rng = torch.Generator().manual_seed(seed)
     order = torch.randperm(len(columns[0]), generator=rng, dtype=torch.int64, device="cpu").to(columns[0].device)
     if len(order) > MAX_PIXELS:
         order = order[:MAX_PIXELS]

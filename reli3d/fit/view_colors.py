@@ -32,8 +32,11 @@ def view_colors(display: Tensor, position: Tensor, camera: Camera) -> tuple[Tens
 
 def display_planes(images: InputImages) -> Tensor:
     """``(V, 4, S, S)``: display values times coverage, and coverage."""
-    shown = linear_to_srgb(images.color.clamp(0.0, 1.0)) * images.mask[..., None]
-    return torch.cat([shown, images.mask[..., None]], -1).permute(0, 3, 1, 2).contiguous()
+    planes = images.color.new_empty(len(images), 4, images.size, images.size)
+    for plane, color, mask in zip(planes, images.color, images.mask, strict=True):  # one view at a time: less memory
+        plane[:3] = (linear_to_srgb(color.clamp(0.0, 1.0)) * mask[..., None]).permute(2, 0, 1)
+        plane[3] = mask
+    return planes
 
 
 @torch.no_grad()

@@ -43,6 +43,13 @@ class Similarity:
         """Transformed ``points (..., 3)``, in their dtype and on their device.  Gradients reach the points."""
         return self.scale * points @ self.rotation.to(points).T + self.translation.to(points)
 
+    def of_cameras(self, c2w: Tensor) -> Tensor:
+        """Transformed camera-to-world matrices ``(..., 4, 4)``, computed in float64; they stay rigid."""
+        exact = c2w.double()
+        rotation = self.rotation.to(exact) @ exact[..., :3, :3]
+        rows = torch.cat([rotation, self.apply(exact[..., :3, 3])[..., None]], -1)
+        return torch.cat([rows, exact[..., 3:, :]], -2).to(c2w.dtype)
+
     @full_precision
     def inverse(self) -> "Similarity":
         """The inverse transform."""

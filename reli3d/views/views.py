@@ -120,10 +120,7 @@ class Views:
 
         ``object_box`` is dropped because it is axis-aligned in the old frame.
         """
-        c2w = self.c2w.double()
-        rotation = similarity.rotation.to(c2w) @ c2w[:, :3, :3]
-        rows = torch.cat([rotation, similarity.apply(c2w[:, :3, 3])[..., None]], -1)
-        return replace(self, c2w=torch.cat([rows, c2w[:, 3:]], -2).to(self.c2w.dtype), object_box=None)
+        return replace(self, c2w=similarity.of_cameras(self.c2w), object_box=None)
 
     def to(self, device: torch.device | str) -> "Views":
         """The same views with their tensors on ``device``."""
@@ -140,18 +137,20 @@ class Views:
         """
         if size < 1:
             raise ValueError(f"size: expected at least 1, got {size}")
-        images, masks, intrinsics = [], [], []
-        for image, mask, camera in zip(self.images, self.masks, self.intrinsics.double()):
+        images, masks = self.c2w.new_empty(len(self), size, size, 3), self.c2w.new_empty(len(self), size, size)
+        intrinsics = []
+        views = zip(self.images, self.masks, self.intrinsics.double(), strict=True)
+        for into, covered, (image, mask, camera) in zip(images, masks, views, strict=True):
             x, y, width, height = _window(mask, padding) if crop else (0, 0, mask.shape[1], mask.shape[0])
             pixels = _cut(image, mask, x, y, width, height)[None]
             pixels = interpolate(pixels, (size, size), mode="bilinear", align_corners=False, antialias=True)[0]
-            images.append(pixels[:3].permute(1, 2, 0).clamp(0.0, 1.0))
-            masks.append(pixels[3].clamp(0.0, 1.0))
+            into.copy_(pixels[:3].permute(1, 2, 0).clamp(0.0, 1.0))
+            covered.copy_(pixels[3].clamp(0.0, 1.0))
             scale = camera.new_tensor([size / width, size / height])
             origin = camera.new_tensor([x, y])
             intrinsics.append(torch.cat([camera[:2] * scale, (camera[2:] - origin) * scale]))
         cameras = torch.stack(intrinsics).to(self.intrinsics.dtype)
-        return ViewBatch(torch.stack(images), torch.stack(masks), self.c2w, cameras, self.names)
+        return ViewBatch(images, masks, self.c2w, cameras, self.names)
 
 
 def mask_box(mask: Tensor) -> tuple[int, int, int, int]:
