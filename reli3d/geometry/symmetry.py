@@ -21,9 +21,11 @@ from reli3d.geometry.hull import hull_distance, hull_span, mirror_residual
 
 # Lengths are fractions of the longest side of the hull's bounding box unless noted.
 RAYS, DEPTHS = 96, 16  # rays per view, and points along each, at which hulls are compared
+RIM_RAYS, RIM_PIXELS = 128, 2.0  # rays of the fine search, per view: those near the silhouette determine the plane
 ANGLES, OFFSETS = 60, 7  # planes of the coarse search
 MAX_OFFSET = 0.06  # of the plane from the hull's center
-FINE_STEPS = 9  # angles and offsets of the fine search, within one coarse step
+FINE_STEPS = 7  # angles and offsets of the fine search
+FINE_LEVELS = 1.0, 0.35  # its half width in coarse steps; each level is centered at the mean of the best planes before
 LOST_RESIDUAL = 0.01  # a pixel whose ray has a larger residual is lost
 MAX_LOST_FRACTION = 0.008  # of the pixels: one-sided parts would be cut off
 SIMILAR_RESIDUAL = 3e-4  # planes whose mean residual is within this of the best are candidates
@@ -81,11 +83,11 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     c2w = camera.c2w.clone()
     c2w[:, :3, 3] = (camera.position - shift) / unit
     camera = Camera(c2w, camera.intrinsics, camera.width, camera.height)
-    points, known = _hull_points(distance, camera)
+    points, known = _hull_points(distance, camera, distance > 0.5, RAYS)
     inside, seen = points[known], known.any(1)
     if len(inside) == 0 or float(seen.float().mean()) < 1.0 - MAX_UNKNOWN_FRACTION:
         return None
-    points, known = points[seen], known[seen]
+    rays = points[seen], known[seen]
     low, high = inside.aminmax(dim=0)
     center, size = (low + high) / 2, float((high - low).max())
     views = functional.normalize(camera.position - center, dim=1)
@@ -96,17 +98,17 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     )
     second = torch.linalg.cross(up, first)
 
-    def residuals(angle: Tensor, offset: Tensor, every: int = 1) -> tuple[Tensor, Tensor]:
+    def residuals(angle: Tensor, offset: Tensor, rays: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         """Mean residual and fraction of lost pixels of the planes at these angles [rad] and offsets from the center."""
         normals = torch.outer(angle.cos(), first) + torch.outer(angle.sin(), second)
         away = normals @ center + size * offset
-        some, within = points[::every, ::every], known[::every, ::every]
-        residual = mirror_residual(some, within, normals, away, MAX_RESIDUAL * size, distance, camera) / size
+        residual = mirror_residual(*rays, normals, away, MAX_RESIDUAL * size, distance, camera) / size
         return residual.mean(1), (residual > LOST_RESIDUAL).float().mean(1)
 
     angles = torch.arange(ANGLES, device=up.device, dtype=torch.float32) * (math.pi / ANGLES)
     offsets = torch.linspace(-MAX_OFFSET, MAX_OFFSET, OFFSETS, device=up.device, dtype=torch.float32)
-    residual, _ = residuals(angles.repeat_interleave(OFFSETS), offsets.repeat(ANGLES), every=3)
+    few = rays[0][::3, ::3], rays[1][::3, ::3]
+    residual, _ = residuals(angles.repeat_interleave(OFFSETS), offsets.repeat(ANGLES), few)
     residual = residual.view(ANGLES, OFFSETS)
     by_angle = residual.amin(1)
     candidates_fraction = float((by_angle < by_angle.min() + SIMILAR_RESIDUAL).float().mean())
@@ -118,15 +120,17 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     normals = torch.outer(angles[planes].cos(), first) + torch.outer(angles[planes].sin(), second)
     best = int(planes[_novelty(normals, views).argmax()])
     equal = residual[best] <= residual[best].min() + EQUAL_RESIDUAL
+    angle, offset = angles[best], offsets[equal].mean()
     around = torch.linspace(-1.0, 1.0, FINE_STEPS, device=up.device, dtype=torch.float32)
-    angle = (angles[best] + around * (math.pi / ANGLES)).repeat_interleave(FINE_STEPS)
-    offset = (offsets[equal].mean() + around * (2 * MAX_OFFSET / (OFFSETS - 1))).repeat(FINE_STEPS)
-    residual, _ = residuals(angle, offset)
-    equal = (residual <= residual.min() + EQUAL_RESIDUAL).nonzero()[:, 0]
-    candidates = torch.stack([angle[equal], offset[equal]], 1)
-    middle = int(equal[(candidates - candidates.mean(0)).norm(dim=1).argmin()])
-    angle, offset = angle[middle], offset[middle]
-    if float(residuals(angle[None], offset[None])[1]) > MAX_LOST_FRACTION:
+    points, known = _hull_points(distance, camera, (distance > 0.5) & (distance < RIM_PIXELS), RIM_RAYS)
+    rim = points[known.any(1)], known[known.any(1)]
+    for width in FINE_LEVELS if len(rim[0]) else ():
+        tried = (angle + width * math.pi / ANGLES * around).repeat_interleave(FINE_STEPS)
+        shifts = (offset + width * 2 * MAX_OFFSET / (OFFSETS - 1) * around).repeat(FINE_STEPS)
+        residual, _ = residuals(tried, shifts, rim)
+        equal = residual <= residual.min() + EQUAL_RESIDUAL
+        angle, offset = tried[equal].mean(), shifts[equal].mean()
+    if float(residuals(angle[None], offset[None], rays)[1]) > MAX_LOST_FRACTION:
         return None
     normal = angle.cos() * first + angle.sin() * second
     return MirrorPlane(normal, float(unit * (normal @ center + size * offset) + normal @ shift))
@@ -164,13 +168,16 @@ def upright(camera: Camera) -> Tensor | None:
     return up if float(up @ camera.c2w[:, :3, 1].sum(0)) > 0 else -up
 
 
-def _hull_points(distance: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Points ``(R, D, 3)`` along rays of silhouette pixels, and whether each lies in the hull ``(R, D)``."""
+def _hull_points(distance: Tensor, camera: Camera, pixels: Tensor, rays: int) -> tuple[Tensor, Tensor]:
+    """Points ``(R, D, 3)`` along up to ``rays`` rays per view, and whether each lies in the hull ``(R, D)``.
+
+    pixels: ``(V, H, W)`` bool, from which the rays are taken at equal intervals.
+    """
     places: list[Tensor] = []
-    for number, inside in enumerate(distance > 0.5):
+    for number, inside in enumerate(pixels):
         found = inside.nonzero()
         every = torch.linspace(
-            0, max(len(found) - 1, 0), min(RAYS, len(found)), device=found.device, dtype=torch.float32
+            0, max(len(found) - 1, 0), min(rays, len(found)), device=found.device, dtype=torch.float32
         ).long()
         places.append(functional.pad(found[every], (1, 0), value=number))
     view, row, column = torch.cat(places).unbind(1)
