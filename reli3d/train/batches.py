@@ -20,7 +20,8 @@ from reli3d.views.views import Views
 
 OTHER_UP_PROBABILITY = 0.12  # of a world that is not +Y up: captures come in any frame
 MAX_NOISE = 0.012  # largest standard deviation of the image noise, sRGB
-RELIGHT_PROBABILITY = 0.5  # of views that are rendered again under another environment
+RELIGHT_PROBABILITY = 0.6  # of views that are rendered again under another environment
+TONE_PROBABILITY, TONE_SIGMA = 0.5, 0.2  # of a camera's tone curve, sRGB ** exponent, and of the exponent's logarithm
 MIRROR_PROBABILITY = 0.4  # of mirror images of the views of a symmetric object, as at inference
 MAX_MIRRORED = 4  # views with mirror images
 UNCHANGED_PROBABILITY = 0.75  # of not mirroring, and of not permuting the color channels
@@ -155,6 +156,8 @@ def load_sample(
         of_pixels = torch.cat([of_pixels[..., channels], of_pixels[..., 3:]], -1)
     color, masks = images[..., :3], images[..., 3]
     if augment:
+        tone = float(np.exp(TONE_SIGMA * rng.normal())) if rng.random() < TONE_PROBABILITY else 1.0
+        color = color**tone
         source = torch.Generator(device).manual_seed(int(rng.integers(1 << 62)))
         noise = torch.randn(color.shape, generator=source, device=device)
         color = (color + float(rng.random()) * MAX_NOISE * noise).clamp(0, 1)
