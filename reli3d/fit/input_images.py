@@ -91,8 +91,8 @@ class InputImages:
         elif light not in ("object", "camera"):
             raise ValueError(f"light: expected object, camera or a name for each view, got {light!r}")
         linear = torch.empty_like(images)
-        for into, image in zip(linear, images.detach(), strict=True):  # one at a time: less memory
-            into.copy_(srgb_to_linear(image))
+        for k, image in enumerate(images.detach()):  # one at a time: less memory
+            linear[k] = srgb_to_linear(image)
         return cls(linear, masks.detach(), camera, group, light == "camera")
 
     def __len__(self) -> int:
@@ -113,9 +113,9 @@ class InputImages:
         if size == self.size:
             return self
         planes = self.color.new_empty(len(self), 4, size, size)
-        for into, color, mask in zip(planes, self.color, self.mask, strict=True):  # one at a time: less memory
+        for k, (color, mask) in enumerate(zip(self.color, self.mask, strict=True)):  # one at a time: less memory
             of_view = torch.cat([color * mask[..., None], mask[..., None]], -1).permute(2, 0, 1)[None]
-            into.copy_(interpolate(of_view, (size, size), mode="bilinear", align_corners=False, antialias=True)[0])
+            planes[k] = interpolate(of_view, (size, size), mode="bilinear", align_corners=False, antialias=True)[0]
         cover = planes[:, 3]
         color = planes[:, :3].permute(0, 2, 3, 1) / cover.clamp(min=1e-4)[..., None]
         camera = self.camera.resized(size, size)

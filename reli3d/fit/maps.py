@@ -25,7 +25,6 @@ from reli3d.render.points import SurfacePoints
 PIXELS_PER_STEP = 6144
 SHADING_SAMPLES = ((6, 6, 2), (12, 12, 4))  # of light, BSDF and cosine, in the first and the second half of a stage
 MAX_PIXELS = 400_000  # of all images: 46 MB; of more, a random subset
-SPARE = 1.5  # times MAX_PIXELS are traced, as some rays miss the surface
 LEARNING_RATES = {"material": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
 GRID_INTERVAL = 0.1  # of a stage's progress, after which the next finer map or grid is optimized as well
 DETAIL_FROM = 0.35  # progress from which the texture detail is optimized
@@ -76,44 +75,35 @@ class Pixels:
 def traced(data: FixedSurface, scene: RayScene, seed: int) -> Pixels:
     """The pixels of the used views that are at least one pixel inside the masks and whose rays hit the surface.
 
-    scene: rays against the surface.  seed: random seed of the order.
+    Of more than ``MAX_PIXELS``, a uniform random sample.  scene: rays against the surface.  seed: random seed of the
+    sample and the order.
     """
     asset, images = data.asset, data.images
-    inside, mesh, parts = images.inside(), asset.mesh, []
-    rng = torch.Generator().manual_seed(seed)
-    share = SPARE * MAX_PIXELS / max(int(inside[data.used].sum()), 1)  # of the pixels whose points are computed
+    inside, mesh = images.inside(), asset.mesh
+    columns: tuple[list[Tensor], ...] = ([], [], [], [], [])
     for view in data.used:
         hits, _, directions = primary_hits(scene, images.camera[view])
         both = inside[view] & (hits.face >= 0)
-        if share < 1.0:
-            both &= (torch.rand(both.shape, generator=rng, dtype=torch.float32, device="cpu") < share).to(both.device)
-        face, bary = hits.face[both], hits.bary[both]
-        at = surface_points(mesh, asset.textures, face, bary)
-        uv = interpolate(present("mesh.uv", mesh.uv), mesh.faces, face, bary)
+        face = hits.face[both]
         of_view = torch.full_like(face, view, dtype=torch.long)
-        parts.append(
-            (
-                of_view,
-                at.position,
-                at.normal,
-                at.ng,
-                -directions[both],
-                uv,
-                material_logits(at),
-                images.color[view][both],
-                interpolate(data.received, mesh.faces, face, bary),
-            )
-        )
-    columns = [torch.cat(column) for column in zip(*parts)]
-    order = torch.randperm(len(columns[0]), generator=rng, dtype=torch.int64, device="cpu").to(columns[0].device)
+        values = (of_view, face, hits.bary[both], -directions[both], images.color[view][both])
+        for column, value in zip(columns, values, strict=True):
+            column.append(value)
+    rng = torch.Generator().manual_seed(seed)
+    order = torch.randperm(sum(map(len, columns[0])), generator=rng, dtype=torch.int64, device="cpu")
+    order = order.to(inside.device)
+    rows = order[:MAX_PIXELS] if len(order) > MAX_PIXELS else slice(None)
+    joined = []
+    for column in columns:
+        joined.append(torch.cat(column)[rows])
+        column.clear()  # less memory
     if len(order) > MAX_PIXELS:
-        order = order[:MAX_PIXELS]
-        columns, order = (
-            [column[order] for column in columns],
-            torch.arange(MAX_PIXELS, device=order.device, dtype=torch.int64),
-        )
-    which, position, normal, ng, wo, uv, logits, target, received = columns
-    return Pixels(which, position, normal, ng, wo, uv, logits, target, received, order)
+        order = torch.arange(MAX_PIXELS, device=order.device, dtype=torch.int64)
+    which, face, bary, wo, target = joined
+    at = surface_points(mesh, asset.textures, face, bary)
+    uv = interpolate(present("mesh.uv", mesh.uv), mesh.faces, face, bary)
+    received = interpolate(data.received, mesh.faces, face, bary)
+    return Pixels(which, at.position, at.normal, at.ng, wo, uv, material_logits(at), target, received, order)
 
 
 @dataclass(frozen=True)

@@ -33,9 +33,9 @@ def view_colors(display: Tensor, position: Tensor, camera: Camera) -> tuple[Tens
 def display_planes(images: InputImages) -> Tensor:
     """``(V, 4, S, S)``: display values times coverage, and coverage."""
     planes = images.color.new_empty(len(images), 4, images.size, images.size)
-    for plane, color, mask in zip(planes, images.color, images.mask, strict=True):  # one view at a time: less memory
-        plane[:3] = (linear_to_srgb(color.clamp(0.0, 1.0)) * mask[..., None]).permute(2, 0, 1)
-        plane[3] = mask
+    for k, (color, mask) in enumerate(zip(images.color, images.mask, strict=True)):  # one at a time: less memory
+        planes[k, :3] = (linear_to_srgb(color.clamp(0.0, 1.0)) * mask[..., None]).permute(2, 0, 1)
+        planes[k, 3] = mask
     return planes
 
 

@@ -21,11 +21,12 @@ from reli3d.geometry.hull import hull_distance, hull_span, mirror_residual
 
 # Lengths are fractions of the longest side of the hull's bounding box unless noted.
 RAYS, DEPTHS = 96, 16  # rays per view, and points along each, at which hulls are compared
-RIM_RAYS, RIM_PIXELS = 128, 2.0  # rays of the fine search, per view: those near the silhouette determine the plane
+RIM_RAYS = 128  # per view, in the fine search
+RIM_PIXELS = 2.0  # width of the band inside the silhouette from which they are taken: its rays determine the plane
 ANGLES, OFFSETS = 60, 7  # planes of the coarse search
 MAX_OFFSET = 0.06  # of the plane from the hull's center
 FINE_STEPS = 7  # angles and offsets of the fine search
-FINE_LEVELS = 1.0, 0.35  # its half width in coarse steps; each level is centered at the mean of the best planes before
+FINE_HALF_WIDTHS = 1.0, 0.35  # of the successive fine searches, in coarse steps, around the mean of the best planes
 LOST_RESIDUAL = 0.01  # a pixel whose ray has a larger residual is lost
 MAX_LOST_FRACTION = 0.008  # of the pixels: one-sided parts would be cut off
 SIMILAR_RESIDUAL = 3e-4  # planes whose mean residual is within this of the best are candidates
@@ -87,7 +88,7 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     inside, seen = points[known], known.any(1)
     if len(inside) == 0 or float(seen.float().mean()) < 1.0 - MAX_UNKNOWN_FRACTION:
         return None
-    rays = points[seen], known[seen]
+    whole = points[seen], known[seen]
     low, high = inside.aminmax(dim=0)
     center, size = (low + high) / 2, float((high - low).max())
     views = functional.normalize(camera.position - center, dim=1)
@@ -98,17 +99,17 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     )
     second = torch.linalg.cross(up, first)
 
-    def residuals(angle: Tensor, offset: Tensor, rays: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    def residuals(angle: Tensor, offset: Tensor, ray_points: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         """Mean residual and fraction of lost pixels of the planes at these angles [rad] and offsets from the center."""
         normals = torch.outer(angle.cos(), first) + torch.outer(angle.sin(), second)
         away = normals @ center + size * offset
-        residual = mirror_residual(*rays, normals, away, MAX_RESIDUAL * size, distance, camera) / size
+        residual = mirror_residual(*ray_points, normals, away, MAX_RESIDUAL * size, distance, camera) / size
         return residual.mean(1), (residual > LOST_RESIDUAL).float().mean(1)
 
     angles = torch.arange(ANGLES, device=up.device, dtype=torch.float32) * (math.pi / ANGLES)
     offsets = torch.linspace(-MAX_OFFSET, MAX_OFFSET, OFFSETS, device=up.device, dtype=torch.float32)
-    few = rays[0][::3, ::3], rays[1][::3, ::3]
-    residual, _ = residuals(angles.repeat_interleave(OFFSETS), offsets.repeat(ANGLES), few)
+    coarse = whole[0][::3, ::3], whole[1][::3, ::3]
+    residual, _ = residuals(angles.repeat_interleave(OFFSETS), offsets.repeat(ANGLES), coarse)
     residual = residual.view(ANGLES, OFFSETS)
     by_angle = residual.amin(1)
     candidates_fraction = float((by_angle < by_angle.min() + SIMILAR_RESIDUAL).float().mean())
@@ -123,14 +124,14 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     angle, offset = angles[best], offsets[equal].mean()
     around = torch.linspace(-1.0, 1.0, FINE_STEPS, device=up.device, dtype=torch.float32)
     points, known = _hull_points(distance, camera, (distance > 0.5) & (distance < RIM_PIXELS), RIM_RAYS)
-    rim = points[known.any(1)], known[known.any(1)]
-    for width in FINE_LEVELS if len(rim[0]) else ():
-        tried = (angle + width * math.pi / ANGLES * around).repeat_interleave(FINE_STEPS)
-        shifts = (offset + width * 2 * MAX_OFFSET / (OFFSETS - 1) * around).repeat(FINE_STEPS)
-        residual, _ = residuals(tried, shifts, rim)
+    rim = (points[known.any(1)], known[known.any(1)]) if bool(known.any()) else whole
+    for width in FINE_HALF_WIDTHS:
+        fine_angles = (angle + width * math.pi / ANGLES * around).repeat_interleave(FINE_STEPS)
+        fine_offsets = (offset + width * 2 * MAX_OFFSET / (OFFSETS - 1) * around).repeat(FINE_STEPS)
+        residual, _ = residuals(fine_angles, fine_offsets, rim)
         equal = residual <= residual.min() + EQUAL_RESIDUAL
-        angle, offset = tried[equal].mean(), shifts[equal].mean()
-    if float(residuals(angle[None], offset[None], rays)[1]) > MAX_LOST_FRACTION:
+        angle, offset = fine_angles[equal].mean(), fine_offsets[equal].mean()
+    if float(residuals(angle[None], offset[None], whole)[1]) > MAX_LOST_FRACTION:
         return None
     normal = angle.cos() * first + angle.sin() * second
     return MirrorPlane(normal, float(unit * (normal @ center + size * offset) + normal @ shift))
@@ -168,8 +169,8 @@ def upright(camera: Camera) -> Tensor | None:
     return up if float(up @ camera.c2w[:, :3, 1].sum(0)) > 0 else -up
 
 
-def _hull_points(distance: Tensor, camera: Camera, pixels: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-    """Points ``(R, D, 3)`` along up to ``rays`` rays per view, and whether each lies in the hull ``(R, D)``.
+def _hull_points(distance: Tensor, camera: Camera, pixels: Tensor, max_rays: int) -> tuple[Tensor, Tensor]:
+    """Points ``(R, D, 3)`` along up to ``max_rays`` rays per view, and whether each lies in the hull ``(R, D)``.
 
     pixels: ``(V, H, W)`` bool, from which the rays are taken at equal intervals.
     """
@@ -177,7 +178,7 @@ def _hull_points(distance: Tensor, camera: Camera, pixels: Tensor, rays: int) ->
     for number, inside in enumerate(pixels):
         found = inside.nonzero()
         every = torch.linspace(
-            0, max(len(found) - 1, 0), min(rays, len(found)), device=found.device, dtype=torch.float32
+            0, max(len(found) - 1, 0), min(max_rays, len(found)), device=found.device, dtype=torch.float32
         ).long()
         places.append(functional.pad(found[every], (1, 0), value=number))
     view, row, column = torch.cat(places).unbind(1)

@@ -20,8 +20,8 @@ from reli3d.views.views import Views
 
 OTHER_UP_PROBABILITY = 0.12  # of a world that is not +Y up: captures come in any frame
 MAX_NOISE = 0.012  # largest standard deviation of the image noise, sRGB
-RELIGHT_PROBABILITY = 0.6  # of views that are rendered again under another environment
-TONE_PROBABILITY, TONE_SIGMA = 0.5, 0.2  # of a camera's tone curve, sRGB ** exponent, and of the exponent's logarithm
+RELIGHT_PROBABILITY = 0.6  # of samples that are rendered again under another environment
+TONE_PROBABILITY, TONE_SIGMA = 0.5, 0.2  # of a random exponent of the sRGB colors; deviation of its logarithm
 MIRROR_PROBABILITY = 0.4  # of mirror images of the views of a symmetric object, as at inference
 MAX_MIRRORED = 4  # views with mirror images
 UNCHANGED_PROBABILITY = 0.75  # of not mirroring, and of not permuting the color channels

@@ -20,7 +20,7 @@ LAMP_PROBABILITY = 0.6  # of lamps added to an environment
 SATURATES = 4.0  # a pixel's radiance, as in reli3d.synthetic.samples
 TINT_SIGMA = 0.1  # standard deviation of the logarithm of the color of the lighting
 EXPOSURE = 0.35  # standard deviation of the logarithm of the exposure
-UNCHANGED_PROBABILITY = 0.3  # of the materials of a relit sample
+UNCHANGED_MATERIAL_PROBABILITY = 0.3  # of the materials of a relit sample
 METAL_PROBABILITY, NONMETAL_PROBABILITY = 0.08, 0.25  # of metallic set to 1, and to 0, everywhere
 GLOSSY_PROBABILITY, GLOSSY_GAIN = 0.4, 0.45  # of nonmetals whose roughness is multiplied: glazes, varnish, plastic
 
@@ -36,8 +36,8 @@ class Finish:
 
     @staticmethod
     def draw(rng: np.random.Generator) -> "Finish":
-        """A random change; the identity with probability ``UNCHANGED_PROBABILITY``."""
-        if rng.random() < UNCHANGED_PROBABILITY:
+        """A random change; the identity with probability ``UNCHANGED_MATERIAL_PROBABILITY``."""
+        if rng.random() < UNCHANGED_MATERIAL_PROBABILITY:
             return Finish(1.0, 1.0, 0.0, None)
         kind = rng.random()
         metallic = 1.0 if kind < METAL_PROBABILITY else 0.0 if kind < METAL_PROBABILITY + NONMETAL_PROBABILITY else None

@@ -139,13 +139,13 @@ class Views:
             raise ValueError(f"size: expected at least 1, got {size}")
         images, masks = self.c2w.new_empty(len(self), size, size, 3), self.c2w.new_empty(len(self), size, size)
         intrinsics = []
-        views = zip(self.images, self.masks, self.intrinsics.double(), strict=True)
-        for into, covered, (image, mask, camera) in zip(images, masks, views, strict=True):
+        for k, camera in enumerate(self.intrinsics.double()):
+            image, mask = self.images[k], self.masks[k]
             x, y, width, height = _window(mask, padding) if crop else (0, 0, mask.shape[1], mask.shape[0])
             pixels = _cut(image, mask, x, y, width, height)[None]
             pixels = interpolate(pixels, (size, size), mode="bilinear", align_corners=False, antialias=True)[0]
-            into.copy_(pixels[:3].permute(1, 2, 0).clamp(0.0, 1.0))
-            covered.copy_(pixels[3].clamp(0.0, 1.0))
+            images[k] = pixels[:3].permute(1, 2, 0).clamp(0.0, 1.0)
+            masks[k] = pixels[3].clamp(0.0, 1.0)
             scale = camera.new_tensor([size / width, size / height])
             origin = camera.new_tensor([x, y])
             intrinsics.append(torch.cat([camera[:2] * scale, (camera[2:] - origin) * scale]))
