@@ -44,7 +44,7 @@ class Similarity:
         return self.scale * points @ self.rotation.to(points).T + self.translation.to(points)
 
     def of_cameras(self, c2w: Tensor) -> Tensor:
-        """Transformed camera-to-world matrices ``(..., 4, 4)``, computed in float64; they stay rigid."""
+        """Rigid camera-to-world matrices ``(..., 4, 4)`` of transformed cameras.  Gradients reach ``c2w``."""
         exact = c2w.double()
         rotation = self.rotation.to(exact) @ exact[..., :3, :3]
         rows = torch.cat([rotation, self.apply(exact[..., :3, 3])[..., None]], -1)
