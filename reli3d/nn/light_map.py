@@ -1,9 +1,9 @@
 """Environment estimation from surface radiance: splatting into lat-long maps, completed by a U-Net on the sphere.
 
 Glossy pixels reflect the light from their mirror direction, diffuse ones the light around their normal.  Both are
-splatted into lat-long maps.  The convolutions, which wrap in azimuth, complete unobserved directions; the result is
-equivariant to rotation about +Y.  The network was trained on maps with -Z at the horizontal center and +X to its right;
-the result has the layout of :mod:`reli3d.render.latlong`.
+splatted bilinearly into lat-long maps.  The U-Net, which wraps in azimuth, completes unobserved directions; the result
+is equivariant to rotation about +Y.  The network was trained on maps with -Z at the horizontal center and +X to its
+right; the result has the layout of :mod:`reli3d.render.latlong`.
 """
 
 import torch
@@ -19,17 +19,22 @@ CHANNELS = 14
 MAX_LOG_RADIANCE = 12.0
 
 
-def trained_texels(directions: Tensor, height: int) -> Tensor:
-    """Texel indices ``(N,)`` of unit world ``directions (N, 3)`` in the layout of the training maps."""
+def trained_texels(directions: Tensor, height: int) -> tuple[Tensor, Tensor]:
+    """:func:`lat_long_texels` of unit world ``directions (N, 3)`` in the layout of the training maps."""
     x, y, z = directions.unbind(-1)
     return lat_long_texels(torch.stack([-z, y, x], -1), height)
 
 
-def gathered(values: Tensor, weight: Tensor, texel: Tensor, height: int) -> tuple[Tensor, Tensor]:
-    """Weighted mean ``(C, H, 2H)`` of ``values (N, C)`` in each texel, and log(1 + total weight) ``(1, H, 2H)``."""
-    count = 2 * height * height
-    total = weight.new_zeros(count).index_add(0, texel, weight)
-    summed = values.new_zeros(count, values.shape[1]).index_add(0, texel, values * weight[:, None])
+def splat(values: Tensor, weight: Tensor, footprint: tuple[Tensor, Tensor], height: int) -> tuple[Tensor, Tensor]:
+    """Weighted mean ``(C, H, 2H)`` of ``values (N, C)`` in each texel, and log(1 + total weight) ``(1, H, 2H)``.
+
+    footprint: of :func:`trained_texels`.
+    """
+    texels, coverage = footprint
+    weight = weight[:, None] * coverage
+    total = weight.new_zeros(2 * height * height).index_add(0, texels.flatten(), weight.flatten())
+    weighted = (weight[..., None] * values[:, None]).flatten(0, 1)
+    summed = values.new_zeros(len(total), values.shape[1]).index_add(0, texels.flatten(), weighted)
     mean = summed / total.clamp(min=1e-4)[:, None]
     shape = (height, 2 * height)
     return mean.T.reshape(-1, *shape), torch.log1p(total).reshape(1, *shape)
@@ -74,12 +79,11 @@ class LightMap(nn.Module):
         mean = (demodulated * facing[:, None]).sum(0) / facing.sum().clamp(min=1e-4)
         scale = 256.0 / max(1, len(radiance))  # makes weights independent of the views' resolution
         at_mirror = trained_texels(mirror, self.height)
-        shown, shown_weight = gathered(
+        shown, shown_weight = splat(
             torch.cat([log - mean, demodulated - mean], -1), facing * (0.05 + gloss) * scale, at_mirror, self.height
         )
-        under, under_weight = gathered(
-            demodulated - mean, facing * scale, trained_texels(normal, self.height), self.height
-        )
+        at_normal = trained_texels(normal, self.height)
+        under, under_weight = splat(demodulated - mean, facing * scale, at_normal, self.height)
         y = lat_long_directions(self.height, device=radiance.device)[..., 1][None]
         rest = torch.cat([y, y.square(), torch.ones_like(y) * mean.mean()])
         x = self.first(torch.cat([shown, shown_weight, under, under_weight, rest])[None])
@@ -88,7 +92,8 @@ class LightMap(nn.Module):
             levels.append(down(levels[-1]))
         x = levels[-1]
         for across, up, finer in zip(reversed(self.across), reversed(self.up), reversed(levels[:-1]), strict=True):
-            coarse = functional.interpolate(across(x), size=finer.shape[-2:], mode="bilinear", align_corners=False)
-            x = up(finer + coarse)
+            wrapped = functional.pad(across(x), (1, 1, 0, 0), mode="circular")
+            coarse = functional.interpolate(wrapped, scale_factor=2, mode="bilinear", align_corners=False)
+            x = up(finer + coarse[..., 2:-2])
         log = (self.out(x)[0] + mean[:, None, None]).clamp(max=MAX_LOG_RADIANCE)
         return log.roll(-(self.height // 2), 2)  # by a quarter of the width: +X at the horizontal center

@@ -23,12 +23,22 @@ def lat_long_directions(
     return torch.stack([phi.cos() * theta.sin(), up, phi.sin() * theta.sin()], -1).to(dtype)
 
 
-def lat_long_texels(directions: Tensor, height: int) -> Tensor:
-    """Flat int64 texel indices ``(...)`` of unit ``directions (..., 3)`` in a ``(height, 2 height)`` map."""
-    x, y, z = directions.unbind(-1)
-    row = (y.clamp(-1.0, 1.0).acos() * (height / math.pi)).long().clamp(0, height - 1)
-    column = ((torch.atan2(z, x) + math.pi) * (height / math.pi)).long() % (2 * height)
-    return row * 2 * height + column
+def lat_long_texels(directions: Tensor, height: int) -> tuple[Tensor, Tensor]:
+    """Bilinear footprint of unit ``directions (N, 3)`` in a ``(height, 2 height)`` map; no gradients.
+
+    Returns flat int64 indices of texels and their weights, both ``(N, 4)``; the weights of a direction sum to 1.
+    Columns wrap, rows end at the poles.
+    """
+    x, y, z = directions.detach().unbind(-1)
+    row = y.clamp(-1.0, 1.0).acos() * (height / math.pi) - 0.5
+    column = (torch.atan2(z, x) + math.pi) * (height / math.pi) - 0.5
+    top, left = row.floor(), column.floor()
+    rows = torch.stack([top, top + 1], -1).long().clamp(0, height - 1)
+    columns = torch.stack([left, left + 1], -1).long() % (2 * height)
+    vertical = torch.stack([1 - (row - top), row - top], -1)
+    horizontal = torch.stack([1 - (column - left), column - left], -1)
+    texels = rows[:, :, None] * (2 * height) + columns[:, None]
+    return texels.flatten(1), (vertical[:, :, None] * horizontal[:, None]).flatten(1)
 
 
 def texel_solid_angles(height: int, width: int, device: torch.device | str = "cpu") -> Tensor:
