@@ -1,8 +1,8 @@
 """Relightable 3D assets from posed photographs, and a library of differentiable operations for them.
 
 The public API consists of the names in ``reli3d.__all__`` (documented by, for example, ``help(reli3d.shade)``), the
-packages ``geometry``, ``render``, ``io`` and ``fit``, and the module ``errors``.  Names in ``__all__`` are imported on
-first use: ``import reli3d`` alone loads neither torch nor Warp.
+packages ``geometry``, ``render``, ``io`` and ``fit``, whose docstrings list their modules, and the module ``errors``.
+All are imported on first use: ``import reli3d`` alone loads neither torch nor Warp.
 """
 
 from importlib import import_module
@@ -35,11 +35,14 @@ _MODULES = {
     "io.hdr": ("read_environment", "write_environment"),
     "io.images": ("write_image",),
 }
+_PACKAGES = ("fit", "geometry", "io", "render")
 _HOME = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
 __all__ = ["__version__", *sorted(_HOME)]
 
 
 def __getattr__(name: str):
+    if name in _PACKAGES:
+        return import_module(f"{__name__}.{name}")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(_HOME[name]), name)
@@ -48,4 +51,4 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME})
+    return sorted({*globals(), *_HOME, *_PACKAGES})

@@ -1,0 +1,8 @@
+"""Fitting of surface, material and lighting to posed images by inverse rendering.
+
+Modules, imported by name (``import reli3d.fit.maps``):
+
+- stages: refine (all of them), shape, maps, lighting
+- data: input_images, view_colors, bounce, light_frame, light_hue
+- parts: losses, unknowns, fields, shading, choice, budget, facets, transfer
+"""

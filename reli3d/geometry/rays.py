@@ -201,7 +201,11 @@ class RayScene:
             far = t_max.detach()
         else:
             far = torch.tensor(float(t_max), device=self.device, dtype=torch.float32)
-        shape = np.broadcast_shapes(origins.shape[:-1], directions.shape[:-1], far.shape)
+        try:
+            shape = np.broadcast_shapes(origins.shape[:-1], directions.shape[:-1], far.shape)
+        except ValueError:
+            got = ", ".join(str(tuple(t.shape)) for t in (origins, directions, far))
+            raise ValueError(f"origins, directions, t_max: expected shapes that broadcast, got {got}") from None
         o = origins.detach().expand(*shape, 3).reshape(-1, 3).contiguous()
         d = directions.detach().expand(*shape, 3).reshape(-1, 3).contiguous()
         far = far.reshape(1) if far.numel() == 1 else far.expand(shape).reshape(-1).contiguous()

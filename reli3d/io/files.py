@@ -1,6 +1,7 @@
 """Reading and writing files safely: one-line errors, size limits, whole files or none."""
 
 import contextlib
+import errno
 import os
 import stat
 from pathlib import Path
@@ -46,6 +47,8 @@ def write_bytes(path: str | os.PathLike, data: bytes) -> None:
 def replacing(path: str | os.PathLike):
     """Yields a temporary path in the folder of ``path``; it replaces ``path`` if the block ends without an error."""
     path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, "the folder does not exist", str(path))
     # short: no file system cuts it
     temporary = path.with_name(f".{os.getpid()}.{os.urandom(4).hex()}{path.suffix[-8:]}")
     try:

@@ -199,7 +199,7 @@ def write_image(path: str | os.PathLike, image: Tensor) -> None:
     if suffix not in (".png", ".exr", ".hdr"):
         raise ValueError(f"path: expected a name that ends in .png, .exr or .hdr, got {shown(os.path.basename(path))}")
     if not isinstance(image, Tensor) or image.dtype != torch.float32:
-        got = getattr(image, "dtype", type(image).__name__)
+        got = image.dtype if isinstance(image, Tensor) else type(image).__name__
         raise TypeError(f"image: expected a float32 tensor, as Render.rgba, got {got}")
     layouts = [(3,)] if suffix == ".hdr" else [(), (3,), (4,)]
     if image.ndim < 2 or image.shape[2:] not in layouts or image.numel() == 0:

@@ -68,8 +68,8 @@ class Render:
     ) -> Tensor:
         """Display values in [0, 1]: ``(H, W, 4)`` with straight alpha, or ``(H, W, 3)`` if not ``transparent``.
 
-        exposure: in stops.  tone: transform from linear radiance to display values.  transparent: use False for images
-        rendered with ``background="environment"``.
+        For screens: :func:`write_image` would encode it again.  exposure: in stops.  tone: transform from linear
+        radiance to display values.  transparent: use False for images rendered with ``background="environment"``.
         """
         radiance = self.radiance * 2.0**exposure
         if transparent:  # tone mapping is nonlinear and needs straight color

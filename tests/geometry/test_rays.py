@@ -114,6 +114,10 @@ def test_degenerate_meshes_are_data_and_broken_ones_are_named(device, backend):
         make(vertices, [[0, 1, 2]], "optix", device)
     with pytest.raises(TypeError, match="origins: expected"):
         scene.closest(o.double(), d)
+    with pytest.raises(
+        ValueError, match=r"origins, directions, t_max: .* that broadcast, got \(2, 3\), \(3, 3\), \(\)"
+    ):
+        scene.closest(o.expand(2, 3), d.expand(3, 3))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

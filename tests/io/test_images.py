@@ -205,8 +205,10 @@ def test_a_linear_image_is_encoded_by_its_suffix(tmp_path):
 def test_invalid_linear_images_are_not_written(tmp_path, name, image, error):
     with pytest.raises(ValueError, match=error):
         write_image(tmp_path / name, image)
-    with pytest.raises(TypeError, match="image: expected a float32 tensor"):
+    with pytest.raises(TypeError, match="image: expected a float32 tensor, as Render.rgba, got ndarray"):
         write_image(tmp_path / "a.png", NOISE)
+    with pytest.raises(FileNotFoundError, match="the folder does not exist: '.*none/a.png'"):
+        write_image(tmp_path / "none" / "a.png", torch.ones(4, 4, 3))
     assert not list(tmp_path.iterdir())
 
 

@@ -187,7 +187,11 @@ def run(code: str) -> subprocess.CompletedProcess:
 
 
 def test_import_is_silent_and_starts_nothing():
-    done = run(f"import sys, reli3d; print(sorted({STARTERS} & set(sys.modules)), reli3d.__version__)")
+    done = run(
+        "import sys, reli3d\n"
+        "assert reli3d.geometry.__doc__ and reli3d.render.__doc__ and reli3d.io.__doc__ and reli3d.fit.__doc__\n"
+        f"print(sorted({STARTERS} & set(sys.modules)), reli3d.__version__)"
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.split() == ["[]", reli3d.__version__]
 

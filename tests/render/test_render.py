@@ -90,6 +90,8 @@ def test_normal_map_points_right_and_up_as_in_gltf(device, explicit):
     ):
         points = surface_points(mesh, textures(4, device, normal=color), face, bary)
         torch.testing.assert_close(points.normal.cpu(), torch.tensor([expected, expected]), rtol=0, atol=1e-5)
+    with pytest.raises(ValueError, match="face: expected hits only"):
+        surface_points(mesh, None, face - 1, bary)
 
 
 def test_texture_on_a_square_is_upright_and_resolved(device):
