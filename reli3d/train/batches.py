@@ -15,7 +15,7 @@ from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.symmetry import MirrorPlane
 from reli3d.render.latlong import lat_long_directions, quarter_turn
 from reli3d.train.mirror import mirrored_visibility, surface_mirror
-from reli3d.train.relight import Finish, draw_light, relight_views
+from reli3d.train.relight import Finish, draw_flash, draw_light, relight_views
 from reli3d.views.views import Views
 
 OTHER_UP_PROBABILITY = 0.12  # of a world that is not +Y up: captures come in any frame
@@ -136,7 +136,8 @@ def load_sample(
     if augment and lights is not None and rng.random() < RELIGHT_PROBABILITY:
         finish = Finish.draw(rng)
         material, of_pixels = finish.apply(material), finish.apply(of_pixels)
-        images, light = relight_views(images, of_pixels, normal, valid, c2w, intrinsics, draw_light(lights, rng), rng)
+        other, flash = draw_light(lights, rng), draw_flash(rng)
+        images, light = relight_views(images, of_pixels, normal, valid, c2w, intrinsics, other, rng, flash)
     turn = random_turn(rng) if augment else torch.eye(3)
     mirrored = augment and rng.random() > UNCHANGED_PROBABILITY
     flip = torch.tensor([-1.0 if mirrored else 1.0, 1.0, 1.0])

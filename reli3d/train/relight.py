@@ -10,6 +10,7 @@ from torch.nn import functional
 from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
+from reli3d.render.material import eval_bsdf
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 from reli3d.synthetic.maps import with_lamps
@@ -20,6 +21,8 @@ LAMP_PROBABILITY = 0.6  # of lamps added to an environment
 SATURATES = 4.0  # a pixel's radiance, as in reli3d.synthetic.samples
 TINT_SIGMA = 0.1  # standard deviation of the logarithm of the color of the lighting
 EXPOSURE = 0.35  # standard deviation of the logarithm of the exposure
+FLASH_PROBABILITY = 0.15  # of a light at every camera, as the flash of a phone
+FLASH_RATIO = 0.5, 8.0  # of the object's mean radiance under it to that under the environment
 UNCHANGED_MATERIAL_PROBABILITY = 0.3  # of the materials of a relit sample
 METAL_PROBABILITY, NONMETAL_PROBABILITY = 0.08, 0.25  # of metallic set to 1, and to 0, everywhere
 GLOSSY_PROBABILITY, GLOSSY_GAIN = 0.4, 0.45  # of nonmetals whose roughness is multiplied: glazes, varnish, plastic
@@ -63,6 +66,11 @@ def draw_light(lights: Tensor, rng: np.random.Generator) -> Tensor:
     return with_lamps(light, rng) if rng.random() < LAMP_PROBABILITY else light
 
 
+def draw_flash(rng: np.random.Generator) -> float:
+    """``flash`` of :func:`relight_views`, with probability ``FLASH_PROBABILITY`` not 0."""
+    return float(np.exp(rng.uniform(*np.log(FLASH_RATIO)))) if rng.random() < FLASH_PROBABILITY else 0.0
+
+
 def relight_views(
     images: Tensor,
     material: Tensor,
@@ -72,11 +80,13 @@ def relight_views(
     intrinsics: Tensor,
     light: Tensor,
     rng: np.random.Generator,
+    flash: float = 0.0,
 ) -> tuple[Tensor, Tensor]:
     """Views ``(V, S, S, 4)`` under ``light (H, 2H, 3)``, and that map as ``(32, 64, 3)`` at the views' exposure.
 
     images: ``(V, S, S, 4)``, of which only alpha is used.  material, normal: of the pixels ``valid (V, S, S)``, as in
-    :mod:`reli3d.synthetic.samples`.  Without shadows: the G-buffers have no geometry behind other surfaces.
+    :mod:`reli3d.synthetic.samples`.  flash: mean radiance of the object under a light at each camera, relative to that
+    under ``light``.  Without shadows: the G-buffers have no geometry behind other surfaces.
     """
     views, size = images.shape[:2]
     light = light.to(images.device)
@@ -91,6 +101,9 @@ def relight_views(
     points = SurfacePoints(torch.zeros_like(n), n, n, srgb_to_linear(base), rough[:, 0], metal[:, 0])
     options = ShadeOptions(samples=SAMPLES, seed=int(rng.integers(1 << 30)), diffuse_model=DIFFUSE_MODEL)
     radiance = shade(points, wo, environment, options=options)
+    if flash:
+        lit = _lit_by_flash(points, wo)
+        radiance = radiance + lit * (flash * radiance.mean() / lit.mean().clamp(min=1e-6))
     first_view = int(valid[0].sum()) or len(radiance)
     bright = float(radiance[:first_view].mean(-1).quantile(0.9))
     exposure = EXPOSURE_TARGET / max(bright, 1e-3) * float(np.exp(rng.normal(0, EXPOSURE)))
@@ -103,3 +116,12 @@ def relight_views(
     linear = ((alpha * surface + (1 - alpha) * background) * exposure).clamp(0, SATURATES).clamp(max=1.0)
     kept = functional.interpolate((light * exposure).permute(2, 0, 1)[None], (32, 64), mode="area")
     return torch.cat([linear_to_srgb(linear), alpha], -1), kept[0].permute(1, 2, 0).clamp(max=6e4)
+
+
+def _lit_by_flash(points: SurfacePoints, wo: Tensor) -> Tensor:
+    """Radiance ``(N, 3)`` towards ``wo (N, 3)`` under unit irradiance from there, perpendicular to ``wo``."""
+    cosine = (points.normal * wo).sum(-1).clamp(0.0, 1.0)
+    local = torch.stack([(1.0 - cosine * cosine).sqrt(), torch.zeros_like(cosine), cosine], -1)
+    alpha = points.roughness * points.roughness
+    bsdf = eval_bsdf(local, points.base_color, alpha, points.metallic, local, diffuse_model=DIFFUSE_MODEL)
+    return bsdf * cosine[:, None]
