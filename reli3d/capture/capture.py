@@ -415,7 +415,9 @@ def _whole_views(source: Path, final: _Segmented, report: CaptureReport) -> list
         views = [v for k, v in enumerate(views) if k != worst]
     if len(views) < FEWEST:
         fix = "take sharper images, or give --masks"
-        if any("border" in reason for reason in report.left_out.values()):
+        if report.epipolar_fit < LEAST_FIT:
+            fix = "something else moves: photograph the object before a background at rest, or give --masks"
+        elif any("border" in reason for reason in report.left_out.values()):
             fix = "step back: the whole object must be in the image"
         elif report.registered < LEAST_REGISTERED * report.images:
             fix = SMALL_STEPS

@@ -51,7 +51,7 @@ class _Bar:
         self.bar = tqdm(file=sys.stderr, disable=None, bar_format="{desc}: {bar:20} {n_fmt}/{total_fmt} {elapsed}")
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        self.bar.set_description(stage, refresh=False)
+        self.bar.set_description_str(stage, refresh=False)
         self.bar.n, self.bar.total = done, total
         self.bar.refresh()
 

@@ -30,6 +30,7 @@ from tqdm import tqdm
 from reli3d.cli.exit_codes import Stopped, log_of, reason, report, signals, write_log
 from reli3d.errors import InputError, printable
 from reli3d.io.files import read_bytes, write_bytes
+from reli3d.views.missing_cameras import VIDEOS
 
 MAX_LIST = 1 << 28  # bytes of a list of folders: a million names of 250 letters
 SUMMARY = "summary.csv"
@@ -131,7 +132,8 @@ def items_of(paths: Sequence[Path], output: Path) -> list[Item]:
 
     A target has the name of its folder, with a number appended to duplicates.  Raises InputError.
     """
-    folders = [folder for path in paths for folder in (listed(path) if path.is_file() else [path])]
+    lists = [path.is_file() and path.suffix.lower() not in VIDEOS for path in paths]
+    folders = [folder for path, many in zip(paths, lists, strict=True) for folder in (listed(path) if many else [path])]
     taken = {SUMMARY}
     last: dict[str, int] = {}
     items = []

@@ -188,8 +188,7 @@ def _chosen(
         taken = choose_views(poses, views or MAX_VIEWS, min_distance=0.0 if views else DUPLICATE_DISTANCE_RAD)
         if len(taken) < count:
             indices = ", ".join(str(usable[i]) for i in taken)
-            text = f"{len(taken)} of {len(frames)} views taken by farthest-point sampling: {indices}"
-            notes.append(f"{text}; load_views(first_views=N) takes the first N")
+            notes.append(f"{len(taken)} of {len(frames)} views taken by farthest-point sampling: {indices}")
     else:
         taken = list(range(count))
     return [usable[i] for i in taken], notes + spread_notes(poses[taken])

@@ -219,6 +219,8 @@ def test_a_list_names_folders(tmp_path):
     assert objects.listed(tmp_path / "bom.txt") == [Path("one"), Path("two")]
     found = objects.items_of([Path("zero"), tmp_path / "bom.txt"], tmp_path)
     assert [item.name for item in found] == ["zero", "one", "two"]
+    (tmp_path / "walk.MOV").write_bytes(b"\xff\xfe")  # a video is no list: load_views names the command for it
+    assert [item.folder for item in objects.items_of([tmp_path / "walk.MOV"], tmp_path)] == [tmp_path / "walk.MOV"]
     (tmp_path / "empty").write_text("\n \n")
     (tmp_path / "bytes").write_bytes(b"\xff\xfe")
     for name, word in (("empty", "got none"), ("bytes", "UTF-8"), ("missing", "not found"), (".", "regular file")):
