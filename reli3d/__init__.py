@@ -35,13 +35,13 @@ _MODULES = {
     "io.hdr": ("read_environment", "write_environment"),
     "io.images": ("write_image",),
 }
-_PACKAGES = ("fit", "geometry", "io", "render")
+_PUBLIC_MODULES = ("errors", "fit", "geometry", "io", "render")
 _HOME = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
 __all__ = ["__version__", *sorted(_HOME)]
 
 
 def __getattr__(name: str):
-    if name in _PACKAGES:
+    if name in _PUBLIC_MODULES:
         return import_module(f"{__name__}.{name}")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -51,4 +51,4 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME, *_PACKAGES})
+    return sorted({*globals(), *_HOME, *_PUBLIC_MODULES})

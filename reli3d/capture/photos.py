@@ -60,7 +60,7 @@ def read_photos(source: Path, progress: Progress) -> tuple[list[Photo], list[str
         raise InputError(source, "expected a folder of photographs or a video (mp4, mov); check the path")
     if len(photos) < FEWEST:
         raise InputError(
-            source, f"expected at least {FEWEST} photographs, got {len(photos)}; take 20 to 60 all around the object"
+            source, f"expected at least {FEWEST} photographs, got {len(photos)}; take 30 to 70 all around the object"
         )
     sizes = {p.size for p in photos}
     if len(sizes) > 1:

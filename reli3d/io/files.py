@@ -48,7 +48,7 @@ def replacing(path: str | os.PathLike):
     """Yields a temporary path in the folder of ``path``; it replaces ``path`` if the block ends without an error."""
     path = Path(path)
     if not path.parent.is_dir():
-        raise FileNotFoundError(errno.ENOENT, "the folder does not exist", str(path))
+        raise FileNotFoundError(errno.ENOENT, "the folder does not exist", str(path.parent))
     # short: no file system cuts it
     temporary = path.with_name(f".{os.getpid()}.{os.urandom(4).hex()}{path.suffix[-8:]}")
     try:

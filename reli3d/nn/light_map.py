@@ -2,8 +2,8 @@
 
 Glossy pixels reflect the light from their mirror direction, diffuse ones the light around their normal.  Both are
 splatted bilinearly into lat-long maps.  The U-Net, which wraps in azimuth, completes unobserved directions; the result
-is equivariant to rotation about +Y.  The network was trained on maps with -Z at the horizontal center and +X to its
-right; the result has the layout of :mod:`reli3d.render.latlong`.
+is equivariant to rotation about +Y by multiples of the coarsest texel.  The network was trained on maps with -Z at the
+horizontal center and +X to its right; the result has the layout of :mod:`reli3d.render.latlong`.
 """
 
 import torch

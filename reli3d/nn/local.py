@@ -26,7 +26,7 @@ from reli3d.nn.field import Field, PointMaterial, bound_sdf, grid_bound_sdf
 from reli3d.nn.heads import ROUGHNESS_MIN, color_logit, mlp
 from reli3d.nn.light_features import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.light_map import LightMap
-from reli3d.nn.presets import CALIBRATED_VIEWS, LocalPreset
+from reli3d.nn.presets import OFFSET_VIEWS, LocalPreset
 from reli3d.nn.pyramid import (
     BINNED,
     OTHERS_AFTER,
@@ -328,7 +328,7 @@ class LocalField(Field):
     def _offset(self) -> float:
         """Outward offset of the surface, in units of ``softness``."""
         many, one = self.model.preset.offset_many_views, self.model.preset.offset_one_view
-        return many + (one - many) / min(len(self.maps.images), CALIBRATED_VIEWS)
+        return many + (one - many) / min(len(self.maps.images), OFFSET_VIEWS)
 
     def sdf(self, points: Tensor) -> Tensor:
         """Field values ``(N,)``: negative inside, zero on the surface, in units of ``softness``."""

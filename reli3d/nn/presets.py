@@ -13,6 +13,7 @@ import typing
 from dataclasses import dataclass
 
 CALIBRATED_VIEWS = 4  # largest number of views at which surface offsets are calibrated
+OFFSET_VIEWS = 8  # number of views from which the surface offset is constant: 8 and 16 have the same best value
 MAX_SIZE, MAX_LAYERS, MAX_LEVELS = 8192, 64, 8  # several times the values of the presets
 LAYERS = ("layers", "blocks", "basic_blocks", "convolutions")
 LIMITS = {  # inclusive; all other integers lie in 1 to MAX_SIZE
@@ -190,7 +191,7 @@ class LocalPreset(_Checked):
     radius: float = 0.87  # half side of the model's cube
     softness: float = 0.02  # unit of the signed distance: occupancy is sigmoid(-distance / softness)
     offset_one_view: float = 0.0  # outward offset of the surface, in units of softness; see reli3d.train.calibrate
-    offset_many_views: float = 0.0  # the same for 1 / V = 0; with V views linear in 1 / min(V, CALIBRATED_VIEWS)
+    offset_many_views: float = 0.0  # the same for 1 / V = 0; with V views linear in 1 / min(V, OFFSET_VIEWS)
     smoothing: int = 8  # iterations of Taubin smoothing of the extracted surface
 
     def __post_init__(self):

@@ -88,7 +88,7 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
     if face.ndim != 1:
         raise ValueError(f"face: expected shape (N,), as hits.face[hits.valid], got {tuple(face.shape)}")
     if len(face) and int(face.min()) < 0:
-        raise ValueError("face: expected hits only, as hits.face[hits.valid], got a miss, -1")
+        raise ValueError("face: expected hits only, as hits.face[hits.valid], got -1")
     position = interpolate(mesh.vertices, mesh.faces, face, bary)
     ng = hit_normals(mesh.vertices, mesh.faces, face)
     normal = ng

@@ -27,7 +27,7 @@ def lat_long_texels(directions: Tensor, height: int) -> tuple[Tensor, Tensor]:
     """Bilinear footprint of unit ``directions (N, 3)`` in a ``(height, 2 height)`` map; no gradients.
 
     Returns flat int64 indices of texels and their weights, both ``(N, 4)``; the weights of a direction sum to 1.
-    Columns wrap, rows end at the poles.
+    Columns wrap, rows are clamped at the poles.
     """
     x, y, z = directions.detach().unbind(-1)
     row = y.clamp(-1.0, 1.0).acos() * (height / math.pi) - 0.5

@@ -58,8 +58,7 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
     0 where ``wm`` faces away from ``wo``, and where either is below the surface.  wo, wm: ``(..., 3)`` unit, local
     frame.  alpha: tensor ``(...)``, GGX width ``roughness**2``.  Leading axes broadcast.  Gradients reach ``wo``,
     ``alpha`` and ``wm``.  Divide by ``4 wo.wm`` for the density of the reflected direction, which may be below the
-    surface (where :func:`pdf_bsdf` is 0).  Raises TypeError unless
-    float32, ValueError for a wrong shape or device.
+    surface (where :func:`pdf_bsdf` is 0).  Raises TypeError unless float32, ValueError for a wrong shape or device.
 
     >>> wm = reli3d.sample_ggx_vndf(wo, alpha, u)
     >>> density = reli3d.pdf_ggx_vndf(wo, alpha, wm)

@@ -6,6 +6,7 @@ unbiased gradient, multiply the residuals of two renderings with different seeds
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import NamedTuple
 
 import torch
@@ -61,7 +62,8 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ShadeOptions:
-    """Options of :func:`shade`: sampling and material model; raises ValueError for an invalid count or choice.
+    """Options of :func:`shade`: sampling and material model; raises ValueError for an invalid count or choice,
+    TypeError for a seed that is no integer.
 
     samples: :class:`Samples`, or its three counts.  seed: gives independent noise; change it in every step of an
     optimization, where a loss of one noisy image is biased; multiply residuals ``(a - t) * (b - t)`` of two seeds.
@@ -89,7 +91,7 @@ class ShadeOptions:
         expect("samples", self.samples, Sequence)
         if len(self.samples) != 3 or any(int(k) != k or k < 0 for k in self.samples):
             raise ValueError(f"samples: expected three counts of at least 0, got {tuple(self.samples)}")
-        expect("seed", self.seed, int)
+        expect("seed", self.seed, Integral)
         for name, allowed in CHOICES.items():
             choice(name, getattr(self, name), allowed)
         if self.clamp is not None and not self.clamp > 0.0:

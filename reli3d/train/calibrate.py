@@ -1,7 +1,8 @@
 """Calibration of the occupancy logit, by normal maps in held-out views.
 
 An uncertain network predicts occupancies below 0.5 at the true surface, which makes shapes too thin.  A constant added
-to the logit compensates.  Uncertainty depends on the number of views, so one and four views have separate constants.
+to the logit compensates.  Uncertainty depends on the number V of views: the constant is linear in 1 / V through the
+best values of one and of four views, up to OFFSET_VIEWS views.
 """
 
 import math

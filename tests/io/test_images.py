@@ -207,7 +207,7 @@ def test_invalid_linear_images_are_not_written(tmp_path, name, image, error):
         write_image(tmp_path / name, image)
     with pytest.raises(TypeError, match="image: expected a float32 tensor, as Render.rgba, got ndarray"):
         write_image(tmp_path / "a.png", NOISE)
-    with pytest.raises(FileNotFoundError, match="the folder does not exist: '.*none/a.png'"):
+    with pytest.raises(FileNotFoundError, match="the folder does not exist: '.*none'"):
         write_image(tmp_path / "none" / "a.png", torch.ones(4, 4, 3))
     assert not list(tmp_path.iterdir())
 

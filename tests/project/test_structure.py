@@ -190,6 +190,7 @@ def test_import_is_silent_and_starts_nothing():
     done = run(
         "import sys, reli3d\n"
         "assert reli3d.geometry.__doc__ and reli3d.render.__doc__ and reli3d.io.__doc__ and reli3d.fit.__doc__\n"
+        "assert reli3d.errors.InputError\n"
         f"print(sorted({STARTERS} & set(sys.modules)), reli3d.__version__)"
     )
     assert (done.returncode, done.stderr) == (0, "")

@@ -2,6 +2,7 @@
 
 from itertools import accumulate
 
+import numpy as np
 import pytest
 import torch
 import trimesh
@@ -330,3 +331,9 @@ def test_memory_does_not_grow_with_samples(device, shadows):
     finally:
         torch.set_num_threads(threads)
     assert words // 2 < many - few < words + 20_000  # measured: the words, and 5 kB for more Halton points
+
+
+def test_a_seed_is_an_integer():
+    assert ShadeOptions(seed=np.int64(3)).seed == 3
+    with pytest.raises(TypeError, match="seed: expected"):
+        ShadeOptions(seed=1.5)

@@ -12,7 +12,7 @@ from reli3d.render.latlong import lat_long_directions, quarter_turn
 from reli3d.synthetic.maps import training_maps
 from reli3d.synthetic.samples import synthesize
 from reli3d.train import batches
-from reli3d.train.relight import Finish, draw_light, relight_views
+from reli3d.train.relight import Finish, draw_flash, draw_light, relight_views
 from tests.support import reference
 from tests.support.surfaces import Ball
 
@@ -79,24 +79,47 @@ def test_another_light_gives_other_photographs(sample, sky):
 
 
 def test_a_flash_lights_pixels_from_the_camera(sample, sky):
-    """Of a flash that outshines the environment: the reference's BSDF for light from the camera, times one exposure."""
+    """The reference's BSDF for light from the camera: of a flash that outshines the sky, and of one half as bright."""
     images, material, normal, valid, c2w, intrinsics = maps_of(sample)
-    got, light = relight_views(images, material, normal, valid, c2w, intrinsics, sky, np.random.default_rng(3), 1e4)
-    plain, _ = relight_views(images, material, normal, valid, c2w, intrinsics, sky, np.random.default_rng(3))
-    assert float(light.mean()) < 1e-3 * float(sky.mean()) and not torch.equal(got, plain)
+
+    def lit(flash):
+        maps = (images, material, normal, valid, c2w, intrinsics)
+        got, light = relight_views(*maps, sky, np.random.default_rng(3), flash)
+        return got[..., :3], (srgb_to_linear(got[..., :3]) * (sky.mean() / light.mean())).double()
+
     directions = torch.stack([camera_rays(Camera(m, k, 96, 96))[1] for m, k in zip(c2w, intrinsics, strict=True)])
-    inner = valid & (images[..., 3] == 1.0) & (got[..., :3] < 0.97).all(-1)
-    cosine = -(functional.normalize(normal, dim=-1) * directions.reshape(normal.shape)).sum(-1)[inner].clamp(max=1.0)
-    local = torch.stack([(1 - cosine**2).sqrt(), torch.zeros_like(cosine), cosine], -1)
-    base, rough, metal = material[inner].split([3, 1, 1], -1)
-    base, shown = (srgb_to_linear(c).double() for c in (base, got[inner][:, :3]))
-    local, alpha, metal = local.double(), rough[:, 0].double() ** 2, metal[:, 0].double()
-    values = reference.eval_bsdf(local, local, base, alpha, metal, "published")
-    expected = values * cosine[:, None]
-    facing = cosine > 0.3  # 8 bits of a normal err by 0.004, which counts where the surface turns away
-    exposure = float((shown[facing] / expected[facing]).median())
-    error = (shown[facing] / (exposure * expected[facing]) - 1).abs()
-    assert int(facing.sum()) > 3000 and float(error.quantile(0.98)) < 0.01  # 0.003 measured, of the environment
+    cosine = (functional.normalize(normal, dim=-1) * -directions.reshape(normal.shape)).sum(-1).clamp(1e-3, 1.0)
+    local = torch.stack([(1 - cosine**2).sqrt(), torch.zeros_like(cosine), cosine], -1).double()
+    base, rough, metal = material.double().split([3, 1, 1], -1)
+    bsdf = reference.eval_bsdf(local, local, srgb_to_linear(base), rough[..., 0] ** 2, metal[..., 0], "published")
+    expected = bsdf * cosine[..., None]
+
+    shown, radiance = lit(1e4)
+    inner = valid & (images[..., 3] == 1.0) & (shown < 0.97).all(-1) & (cosine > 0.3)  # 8 bits of normals err by 0.004
+    relative = radiance[inner] / expected[inner]
+    error = (relative / relative.median() - 1).abs()
+    assert int(inner.sum()) > 3000 and float(error.quantile(0.98)) < 0.01  # 0.003 measured, of the sky
+
+    (plain_shown, plain), (half_shown, half) = lit(0.0), lit(0.5)
+    added = expected * (0.5 * plain[valid].mean() / expected[valid].mean())
+    whole = inner & (plain_shown < 0.97).all(-1) & (half_shown < 0.97).all(-1)
+    ratio = float((half - plain)[whole].mean() / added[whole].mean())
+    assert ratio == pytest.approx(1.0, abs=0.01)  # the plain image is clipped in a few pixels
+
+
+def test_some_samples_are_relit_with_a_flash(sample, sky, tmp_path, monkeypatch):
+    ratios = np.array([draw_flash(np.random.default_rng(k)) for k in range(2000)])
+    used = ratios[ratios > 0]
+    assert 236 < len(used) < 364  # 0.15 of 2000, 4 standard deviations
+    assert 0.5 <= used.min() < 0.6 and 7.0 < used.max() <= 8.0
+    save_file(sample, tmp_path / "0.safetensors")
+    monkeypatch.setattr(batches, "RELIGHT_PROBABILITY", 1.0)
+    images = []
+    for flash in (0.0, 4.0):
+        monkeypatch.setattr(batches, "draw_flash", lambda rng, flash=flash: flash)
+        drawn = batches.load_sample(tmp_path / "0.safetensors", 2, 64, np.random.default_rng(5), lights=sky[None])
+        images.append(drawn.images)
+    assert not torch.equal(*images)
 
 
 def test_a_finish_is_the_same_for_pixels_and_points():
