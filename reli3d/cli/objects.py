@@ -132,8 +132,10 @@ def items_of(paths: Sequence[Path], output: Path) -> list[Item]:
 
     A target has the name of its folder, with a number appended to duplicates.  Raises InputError.
     """
-    lists = [path.is_file() and path.suffix.lower() not in VIDEOS for path in paths]
-    folders = [folder for path, many in zip(paths, lists, strict=True) for folder in (listed(path) if many else [path])]
+    folders: list[Path] = []
+    for path in paths:
+        is_list = path.is_file() and path.suffix.lower() not in VIDEOS
+        folders += listed(path) if is_list else [path]
     taken = {SUMMARY}
     last: dict[str, int] = {}
     items = []

@@ -62,18 +62,17 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ShadeOptions:
-    """Options of :func:`shade`: sampling and material model; raises ValueError for an invalid count or choice,
-    TypeError for a seed that is no integer.
+    """Options of :func:`shade`: sampling and material model; raises ValueError, or TypeError for a wrong type.
 
-    samples: :class:`Samples`, or its three counts.  seed: gives independent noise; change it in every step of an
-    optimization, where a loss of one noisy image is biased; multiply residuals ``(a - t) * (b - t)`` of two seeds.
-    antithetic: pairs of visible-normal samples: ``opposite`` (see :func:`reli3d.antithetic`), ``mirrored`` (as in
-    ReLi3D), ``none``.  heuristic: MIS weights, ``balance`` or ``power``.  sequence: ``halton``, rotated per point and
-    strategy, or ``random``.  alpha: GGX width, ``squared`` roughness or, as in ReLi3D, ``linear``.  diffuse_model: see
-    :func:`reli3d.eval_bsdf`.  clamp: limit per channel of ``w * f * L * cos(theta) / p`` of a sample (w: MIS weight).
-    check_inputs: ValueError for unnormalized directions, materials outside [0, 1], non-finite values.
+    samples: :class:`Samples`, or three counts.  seed: of the noise; change it in every step of an optimization.  A loss
+    of one image is biased; use the product of two seeds' residuals.  antithetic: pairs of visible-normal samples:
+    ``opposite`` (see :func:`reli3d.antithetic`), ``mirrored`` (ReLi3D), ``none``.  heuristic: ``balance`` or
+    ``power``.  sequence: ``halton``, rotated per point and strategy, or ``random``.  alpha: GGX width, ``squared``
+    roughness or, as in ReLi3D, ``linear``.  diffuse_model: see :func:`reli3d.eval_bsdf`.  clamp: limit per channel of a
+    sample's contribution, MIS weight included.  check_inputs: ValueError for unnormalized directions, materials outside
+    [0, 1], non-finite values.
 
-    >>> fast = reli3d.ShadeOptions(samples=reli3d.Samples(light=4, bsdf=4, cosine=2), seed=1)
+    >>> fast = reli3d.ShadeOptions(samples=(4, 4, 2), seed=1)
     >>> image = reli3d.render_asset(asset, camera, light, options=fast)
     """
 
@@ -116,9 +115,9 @@ def shade(
 ) -> Tensor:
     """Reflected radiance ``(N, 3)`` of surface points towards ``wo`` under ``environment``; linear Rec. 709.
 
-    wo: ``(N, 3)`` unit, world frame, to the viewer (minus the camera ray's direction), or one row for all points.  Back
-    faces are shaded like front faces.  scene: occluders; None: no shadows.  pixels: ``(N,)`` int32, seeds each point's
-    samples with ``options.seed``; None: the row.  Non-finite inputs give NaN.
+    wo: ``(N, 3)`` unit, world frame, minus the camera ray's direction, or one row.  Back faces are shaded like front
+    faces.  scene: occluders; None: no shadows.  pixels: ``(N,)`` int32, seeds each point's samples with
+    ``options.seed``; None: the row.  Non-finite inputs give NaN.
 
     Gradients, once differentiable, reach normal (its orthogonal part counts), base_color, roughness, metallic and the
     environment's texels, at constant directions, densities, MIS weights and visibility.  Bitwise reproducible.  Raises

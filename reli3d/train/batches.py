@@ -137,7 +137,8 @@ def load_sample(
         finish = Finish.draw(rng)
         material, of_pixels = finish.apply(material), finish.apply(of_pixels)
         other, flash = draw_light(lights, rng), draw_flash(rng)
-        images, light = relight_views(images, of_pixels, normal, valid, c2w, intrinsics, other, rng, flash)
+        camera = Camera(c2w, intrinsics, *images.shape[2:0:-1])
+        images, light = relight_views(images, of_pixels, normal, valid, camera, other, rng, flash)
     turn = random_turn(rng) if augment else torch.eye(3)
     mirrored = augment and rng.random() > UNCHANGED_PROBABILITY
     flip = torch.tensor([-1.0 if mirrored else 1.0, 1.0, 1.0])

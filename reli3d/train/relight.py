@@ -67,7 +67,7 @@ def draw_light(lights: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def draw_flash(rng: np.random.Generator) -> float:
-    """``flash`` of :func:`relight_views`, with probability ``FLASH_PROBABILITY`` not 0."""
+    """Random ``flash`` of :func:`relight_views`; 0 with probability 1 - ``FLASH_PROBABILITY``."""
     return float(np.exp(rng.uniform(*np.log(FLASH_RATIO)))) if rng.random() < FLASH_PROBABILITY else 0.0
 
 
@@ -76,8 +76,7 @@ def relight_views(
     material: Tensor,
     normal: Tensor,
     valid: Tensor,
-    c2w: Tensor,
-    intrinsics: Tensor,
+    camera: Camera,
     light: Tensor,
     rng: np.random.Generator,
     flash: float = 0.0,
@@ -85,14 +84,14 @@ def relight_views(
     """Views ``(V, S, S, 4)`` under ``light (H, 2H, 3)``, and that map as ``(32, 64, 3)`` at the views' exposure.
 
     images: ``(V, S, S, 4)``, of which only alpha is used.  material, normal: of the pixels ``valid (V, S, S)``, as in
-    :mod:`reli3d.synthetic.samples`.  flash: mean radiance of the object under a light at each camera, highlights
-    included, relative to that under ``light``.  Without shadows: the G-buffers have no geometry behind other surfaces.
+    :mod:`reli3d.synthetic.samples`.  camera: the batch of V.  flash: mean radiance of the object under a light at each
+    camera, highlights included, relative to that under ``light``.  Without shadows: the G-buffers have no geometry
+    behind other surfaces.
     """
     views, size = images.shape[:2]
     light = light.to(images.device)
     environment = Environment(light.contiguous())
-    directions = torch.stack([camera_rays(Camera(c2w[k], intrinsics[k], size, size))[1] for k in range(views)])
-    directions = directions.reshape(views, size, size, 3)
+    directions = camera_rays(camera)[1]
     wo = -directions[valid]
     n = functional.normalize(normal[valid], dim=-1)
     behind = (n * wo).sum(-1, keepdim=True)

@@ -197,6 +197,12 @@ def test_import_is_silent_and_starts_nothing():
     assert done.stdout.split() == ["[]", reli3d.__version__]
 
 
+@pytest.mark.parametrize("package", ["fit", "geometry", "io", "render"])
+def test_the_docstring_of_a_public_package_names_its_modules(package):
+    modules = {path.stem for path in (ROOT / "reli3d" / package).glob("[a-z]*.py")}
+    assert modules <= set(re.findall(r"\w+", getattr(reli3d, package).__doc__))
+
+
 def test_public_names_load_without_network_device_or_output():
     """All but the pipeline's, which holds the networks."""
     names = [name for name in reli3d.__all__ if getattr(getattr(reli3d, name), "__module__", "") != "reli3d.pipeline"]

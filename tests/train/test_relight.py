@@ -44,8 +44,7 @@ def maps_of(sample):
         sample["view_material"].float() / 255,
         sample["view_normal"].float() / 127,
         valid,
-        sample["c2w"],
-        sample["intrinsics"],
+        Camera(sample["c2w"], sample["intrinsics"], 96, 96),
     )
 
 
@@ -80,15 +79,13 @@ def test_another_light_gives_other_photographs(sample, sky):
 
 def test_a_flash_lights_pixels_from_the_camera(sample, sky):
     """The reference's BSDF for light from the camera: of a flash that outshines the sky, and of one half as bright."""
-    images, material, normal, valid, c2w, intrinsics = maps_of(sample)
+    images, material, normal, valid, camera = maps_of(sample)
 
     def lit(flash):
-        maps = (images, material, normal, valid, c2w, intrinsics)
-        got, light = relight_views(*maps, sky, np.random.default_rng(3), flash)
+        got, light = relight_views(images, material, normal, valid, camera, sky, np.random.default_rng(3), flash)
         return got[..., :3], (srgb_to_linear(got[..., :3]) * (sky.mean() / light.mean())).double()
 
-    directions = torch.stack([camera_rays(Camera(m, k, 96, 96))[1] for m, k in zip(c2w, intrinsics, strict=True)])
-    cosine = (functional.normalize(normal, dim=-1) * -directions.reshape(normal.shape)).sum(-1).clamp(1e-3, 1.0)
+    cosine = (functional.normalize(normal, dim=-1) * -camera_rays(camera)[1]).sum(-1).clamp(1e-3, 1.0)
     local = torch.stack([(1 - cosine**2).sqrt(), torch.zeros_like(cosine), cosine], -1).double()
     base, rough, metal = material.double().split([3, 1, 1], -1)
     bsdf = reference.eval_bsdf(local, local, srgb_to_linear(base), rough[..., 0] ** 2, metal[..., 0], "published")
