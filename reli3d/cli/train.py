@@ -20,7 +20,7 @@ LIGHT_PRIOR = "light_prior"
 SIDES = 64, 128, 256  # of the images of stage pixels
 OF_LOOP = ("steps", "minutes", "batch", "rate", "seed", "save_every", "tensorboard")
 OF_NETWORK = ("weights", "validation", "export", "license", "max_views", "bfloat16", "device")
-OF_SMALL = (*OF_NETWORK, "points", "pyramid_rate", "maps", "material_bins")
+OF_SMALL = (*OF_NETWORK, "points", "pyramid_rate", "maps")
 OF_CONFIG = ("image_size", "patch", "targets", "lobes", "resolution", "samples", "shadows")  # of a StageConfig
 OF_PAPER = (*OF_NETWORK, *OF_CONFIG, "preset", "prior", "perceptual", "checkpointing")
 
@@ -75,12 +75,6 @@ def parser() -> argparse.ArgumentParser:
         metavar="TIMES",
         help="multiplier of the learning rate of the 2D U-Net; 0.1 after stage pixels",
     )
-    small.add_argument(
-        "--material-bins",
-        type=int,
-        metavar="N",
-        help="roughness and metallic of pixels are distributions over N values (8); default as in the weights",
-    )
     small.add_argument("--maps", type=Path, help="environment maps, .npz, under which half of the samples are relit")
     paper = p.add_argument_group("stages of the ReLi3D paper's network, and --image-size of pixels")
     paper.add_argument("--image-size", type=int, help="pixels per side; for stage pixels 64 (default), 128 or 256")
@@ -110,7 +104,6 @@ def parsed(argv: list[str] | None) -> argparse.Namespace:
             raise InputError(f"--{name.replace('_', '-')}", f"expected none for stage {args.stage}; leave it out")
     check_ranges(args, steps=(0, 10**9), minutes=(1e-3, math.inf), batch=(1, 4096), rate=(1e-9, 10.0), seed=(0, 10**9))
     check_ranges(args, save_every=(1, 10**9), max_views=(1, 16), points=(2, 16384), pyramid_rate=(1e-6, 10.0))
-    check_ranges(args, material_bins=(2, 64))
     check_ranges(args, image_size=(8, 2048), patch=(0, 2048), targets=(1, 16), lobes=(1, 4096), resolution=(4, 256))
     check_folder(args.output)
     if "export" in args:
@@ -129,7 +122,6 @@ def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
 def small_stage(args: argparse.Namespace) -> "Stage":
     """A stage of the small network."""
     from reli3d.nn.presets import CALIBRATED_VIEWS
-    from reli3d.nn.value_bins import with_bins
     from reli3d.synthetic.stored import check_samples
     from reli3d.train.pixels import reduced_model
     from reli3d.train.small import PixelStage, SmallOptions, SmallStage
@@ -150,8 +142,6 @@ def small_stage(args: argparse.Namespace) -> "Stage":
     if pixels and side not in SIDES:
         raise InputError("--image-size", f"expected {', '.join(map(str, SIDES))} for stage pixels, got {side}")
     model = small_network(getattr(args, "weights", None), args.output / "state.pt")
-    if "material_bins" in args:
-        model = with_bins(model, args.material_bins)
     finest = SIDES[::-1].index(side) if pixels else 0
     model = reduced_model(model, finest).train() if finest else model
     options = SmallOptions(**given(args, "max_views", "points", "pyramid_rate", "bfloat16"))

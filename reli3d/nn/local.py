@@ -28,9 +28,6 @@ from reli3d.nn.light_features import Shading, brightness_at, brightness_over_nor
 from reli3d.nn.light_map import LightMap
 from reli3d.nn.presets import OFFSET_VIEWS, LocalPreset
 from reli3d.nn.pyramid import (
-    BINNED,
-    OTHERS_AFTER,
-    OTHERS_BEFORE,
     ImagePyramid,
     depth_of_origin,
     pixel_hull_depths,
@@ -50,9 +47,8 @@ VIEW_WEIGHT = (
     7  # of its columns: greatest blend weight of a view: about 0 where none shows the point, 1 where one faces it
 )
 HEAD_OUTPUTS = 13  # width of LocalField.heads
-NORMAL_RIGHT = -OTHERS_AFTER  # of the pyramid's predictions: changes its sign under a left-right flip of the image
+NORMAL_RIGHT = -5  # of the pyramid's predictions: changes its sign under a left-right flip of the image
 METALLIC_LOGIT = -2.0  # where the prediction is zero
-MIN_EXPECTATION = 1e-4  # of a distribution over bins, away from 0 and 1: keeps its logit finite
 VIEW_WEIGHT_POWER = 2.0  # exponent of the blend weights: favors frontal views, with smooth seams
 
 
@@ -66,7 +62,6 @@ class PixelMaps:
     roughness: Tensor  # (V, P, P, 1) logit
     metallic: Tensor  # (V, P, P, 1) logit
     chroma: Tensor  # (V, P, P, 1) gain of the color logits minus their mean
-    bins: Tensor  # (V, P, P, 2, B) log probability of roughness and metallic k / (B - 1); with B = 1 nothing
     normal: Tensor  # (V, P, P, 3) world, unit
     depth: Tensor  # (V, P, P, 1) along the camera axis, relative to the world origin's
 
@@ -76,16 +71,13 @@ class PixelMaps:
 
     @staticmethod
     def of(raw: Tensor, span: Tensor, camera: Camera, mean: Tensor) -> PixelMaps:
-        """Decodes the pyramid's output ``raw (V, P, P, 10 + 2 B)`` at the pixels of ``camera``, with ``B`` bins.
+        """Decodes the pyramid's output ``raw (V, P, P, 12)`` at the pixels of ``camera``.
 
         span: ``(V, Q, Q, 2)``, depths at which each ray enters and leaves the hull.  mean: :func:`mean_logit` of the
         object, broadcast over the pixels.  The gain applies to the difference from ``mean``, because exposure makes the
         absolute brightness of an object ambiguous, but not its hue and contrast.
         """
-        bins = (raw.shape[-1] - OTHERS_BEFORE - OTHERS_AFTER) // BINNED
-        gain, shift, confidence, finish, normal, depth, chroma = raw.split([1, 3, 1, BINNED * bins, 3, 1, 1], -1)
-        log_bins, finish = binned(finish.unflatten(-1, (BINNED, bins)))
-        rough, metal = finish.split(1, -1)
+        gain, shift, confidence, rough, metal, normal, depth, chroma = raw.split([1, 3, 1, 1, 1, 3, 1, 1], -1)
         x, y = image_plane(camera)
         toward = -functional.normalize(torch.stack([x, y, -torch.ones_like(x)], -1), dim=-1)  # towards the camera
         normal = functional.normalize(0.3 * toward + normal, dim=-1)
@@ -94,10 +86,10 @@ class PixelMaps:
         span = functional.interpolate(span.permute(0, 3, 1, 2), size=size, mode="nearest").permute(0, 2, 3, 1)
         depth = torch.lerp(span[..., :1], span[..., 1:], (depth - 1.0).sigmoid())  # inside the hull
         gain, chroma = (gain + 2.0).sigmoid(), 2.0 * chroma.sigmoid()
-        return PixelMaps(gain, shift - gain * mean, confidence, rough, metal, chroma, log_bins, world, depth)
+        return PixelMaps(gain, shift - gain * mean, confidence, rough, metal + METALLIC_LOGIT, chroma, world, depth)
 
     def stacked(self) -> Tensor:
-        """All maps but bins and depth, ``(V, P, P, 11)``."""
+        """All maps but depth, ``(V, P, P, 11)``."""
         material = [self.gain, self.shift, self.confidence, self.roughness, self.metallic, self.chroma]
         return torch.cat([*material, self.normal], -1)
 
@@ -110,22 +102,6 @@ class PixelMaps:
     def base_logit(self, color: Tensor) -> Tensor:
         """Base color logit ``(V, P, P, 3)`` of pixels with the observed ``color (V, P, P, 3)``, sRGB."""
         return base_color_logit(color, self.gain, self.chroma, self.shift)
-
-
-def binned(raw: Tensor) -> tuple[Tensor, Tensor]:
-    """Log probabilities ``(..., 2, B)`` of roughness and metallic, and the logits ``(..., 2)`` of their expectations.
-
-    raw: ``(..., 2, B)``, added to the logits of a binomial distribution; with B = 1 the logits themselves.  See
-    :mod:`reli3d.nn.value_bins`.
-    """
-    bins, zero = raw.shape[-1], raw.new_tensor([0.0, METALLIC_LOGIT])
-    if bins == 1:
-        return torch.zeros_like(raw), raw[..., 0] + zero
-    steps = torch.arange(bins, device=raw.device, dtype=raw.dtype)
-    ways = -torch.lgamma(steps + 1.0) - torch.lgamma(bins - steps)  # logarithms of binomial coefficients, to a constant
-    log_bins = (raw + zero[:, None] * steps + ways).log_softmax(-1)
-    expected = (log_bins.exp() * steps).sum(-1) / (bins - 1)
-    return log_bins, expected.clamp(MIN_EXPECTATION, 1.0 - MIN_EXPECTATION).logit()
 
 
 def base_color_logit(color: Tensor, gain: Tensor, chroma: Tensor, shift: Tensor) -> Tensor:

@@ -22,7 +22,6 @@ LIMITS = {  # inclusive; all other integers lie in 1 to MAX_SIZE
     "tokens": (2, MAX_SIZE),
     "view_width": (10, MAX_SIZE),  # nine of them are the numbers of summarize_views
     "side": (4, 256),
-    "material_bins": (1, 64),
     "height": (4, 512),
     "resolution": (4, 512),
     "image_size": (8, 4096),
@@ -145,7 +144,6 @@ class PyramidSizes(_Checked):
     widths: tuple[int, ...]  # channels at 1/2, 1/4, ... of the image
     features: int  # that leave it
     reading: int  # the finest levels, which read the image at their own resolution and predict
-    material_bins: int = 1  # values over which roughness and metallic are distributions; 1: single logits
 
     def __post_init__(self):
         super().__post_init__()
@@ -244,7 +242,10 @@ def from_json(text: str) -> Preset | LocalPreset:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"preset: expected the JSON of a preset, got {error}") from None
-    return _build(LocalPreset if isinstance(values, dict) and "pyramid" in values else Preset, values, "preset")
+    local = isinstance(values, dict) and "pyramid" in values
+    if local and isinstance(values["pyramid"], dict) and values["pyramid"].get("material_bins") == 1:
+        del values["pyramid"]["material_bins"]  # in files of version 0.4 and before
+    return _build(LocalPreset if local else Preset, values, "preset")
 
 
 def _build(kind, values, path: str):

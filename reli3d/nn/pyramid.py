@@ -15,14 +15,9 @@ from reli3d.geometry.hull import hull_span
 from reli3d.nn.presets import PyramidSizes
 
 INPUTS = 9  # color times mask (3), mask, position in the world (2), depths of the hull along the ray (2), 1 / views
-OTHERS_BEFORE, BINNED, OTHERS_AFTER = 5, 2, 5  # predictions of a pixel, see PixelMaps: roughness, metallic have bins
+PREDICTIONS = 12  # of a pixel, see PixelMaps
 MIN_COVERAGE = 0.1  # of a pixel whose ray is intersected with the hull
 CLIP_RADIUS = 0.87  # of the sphere around the origin that clips the hull: circumscribes a cube of side 1
-
-
-def predicted_width(sizes: PyramidSizes) -> int:
-    """Number of predictions of a pixel."""
-    return OTHERS_BEFORE + BINNED * sizes.material_bins + OTHERS_AFTER
 
 
 def block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -108,8 +103,7 @@ class ImagePyramid(nn.Module):
         self.across = nn.ModuleDict({k: nn.Conv2d(coarse, fine, 1) for k, (fine, coarse) in pairs.items()})
         self.up = nn.ModuleDict({k: block(fine, fine) for k, (fine, _) in pairs.items()})
         predicted = {
-            str(k): nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], predicted_width(sizes), 1))
-            for k in reading
+            str(k): nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], PREDICTIONS, 1)) for k in reading
         }
         self.says = nn.ModuleDict(predicted)
         if finest == 0:

@@ -5,7 +5,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from reli3d.nn.local import LocalField, LocalReconstructor, PixelMaps
-from reli3d.nn.value_bins import bin_loss
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.train.batches import Sample, TrainingViews
@@ -159,17 +158,13 @@ def _pixel_terms(pixels: PixelMaps, shown: Tensor, views: TrainingViews, counts:
 
 
 def _finish(pixels: PixelMaps, views: TrainingViews) -> dict[str, Tensor]:
-    """Cross-entropy of roughness and metallic per pixel, over bins if the model has them; empty without targets."""
+    """Cross-entropy of roughness and metallic per pixel; empty without targets."""
     valid = views.view_valid & views.finish_known[:, None, None]
     if not bool(valid.any()):
         return {}
     target, found = views.view_material[valid][:, 3:], {}
     for k, name in enumerate(("roughness", "metallic")):
-        if pixels.bins.shape[-1] > 1:
-            loss = bin_loss(pixels.bins[..., k, :][valid], target[:, k])
-        else:
-            loss = excess_entropy(getattr(pixels, name)[valid][:, 0].sigmoid(), target[:, k])
-        found[f"pixel_{name}"] = loss
+        found[f"pixel_{name}"] = excess_entropy(getattr(pixels, name)[valid][:, 0].sigmoid(), target[:, k])
     return found
 
 

@@ -1,7 +1,5 @@
 """A scan without a metallic-roughness texture has placeholders: its shape and base color train, its finish does not."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -11,10 +9,8 @@ from safetensors.torch import load_file, save_file
 
 from reli3d.cli.data import main as data
 from reli3d.cli.samples import SampleSpec
-from reli3d.cli.train import main, small_network
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.presets import SMALL
-from reli3d.nn.value_bins import with_bins
 from reli3d.train.batches import load_sample
 from reli3d.train.losses import losses, pixel_losses
 from reli3d.train.pixels import Group, read_views_reduced
@@ -60,13 +56,11 @@ def test_a_sample_of_version_0_3_does_not_store_it_and_is_known(scans, tmp_path)
     assert read_views_reduced(tmp_path / "old.safetensors", 1).finish_known.tolist() == [True, True]
 
 
-@pytest.mark.parametrize("bins", [1, 8])
-def test_an_unknown_finish_takes_part_in_no_loss(scans, bins):
+def test_an_unknown_finish_takes_part_in_no_loss(scans):
     torch.manual_seed(0)
     model = LocalReconstructor(SMALL)
     for head in model.pyramid.says.values():
         torch.nn.init.normal_(head[1].weight, std=0.3)
-    model = with_bins(model, bins)
     plain, refinished = (read_views_reduced(path_of(scans, name), 1) for name in ("plain", "refinished"))
     alone = pixel_losses(model, Group.of([plain]))
     assert set(alone) == {"pixel_color", "pixel_pattern", "pixel_normal", "pixel_depth"}
@@ -85,16 +79,3 @@ def test_the_papers_stages_have_no_material_of_an_unknown_finish(scans):
     for name, known in (("plain", False), ("refinished", True)):
         views = Samples(scans / name).load(0, range)
         assert (views.material is not None) == known and views.normal is not None
-
-
-def test_a_run_over_bins_resumes_and_starts_the_next_one(scans, tmp_path, capsys):
-    call = [str(scans / "refinished"), str(tmp_path / "run"), "--batch", "1"]
-    pixels = ["--stage", "pixels", "--image-size", "64"]
-    assert main([*call, *pixels, "--steps", "1", "--material-bins", "8"]) == 0
-    assert main([*call, *pixels, "--steps", "2"]) == 0  # without the option the checkpoint's preset is used
-    state = torch.load(tmp_path / "run" / "state.pt", weights_only=True)
-    assert state["step"] == 2 and state["average"]["pyramid.says.2.1.bias"].shape == (26,)
-    started = small_network(str(tmp_path / "run" / "state.pt"), tmp_path / "none")
-    assert started.preset == dataclasses.replace(SMALL, pyramid=dataclasses.replace(SMALL.pyramid, material_bins=8))
-    assert main([*call, *pixels, "--steps", "3", "--material-bins", "4"]) == 2
-    assert "material_bins: expected 8, as the weights have, got 4" in capsys.readouterr().err
