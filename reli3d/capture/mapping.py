@@ -22,7 +22,9 @@ from reli3d.errors import InputError
 
 FEATURES = 4096  # SIFT features of an image
 MAP_SIDES = 1000, 2000  # pixels along the longer side, first and where too few images are registered
-LOW_PEAK = 0.003  # SIFT's peak threshold where too few are registered; its default is 0.0067
+LOW_PEAK = 0.003  # SIFT's peak threshold: with its default, 0.0067, a dark object has 0.7 times the points
+MATCH_RATIO = 0.85  # of the distances to the nearest and second descriptor: with 0.8 it has 0.75 times the points
+PAIR_TRIALS = 1000  # of RANSAC for a pair of images: few overlap; COLMAP's 10,000 make matching 4 times slower
 ENOUGH = 0.8  # fraction of the images whose registration needs no retry
 EXHAUSTIVE = 100  # images up to which each is matched with each
 SEED = 0
@@ -115,9 +117,9 @@ def map_photos(
     """The largest map of ``photos``.
 
     masks: ``(H, W)`` of each photo, nonzero where features are looked for.  Where less than ENOUGH of the photos are
-    registered it is tried again with a lower contrast threshold and a relaxed first pair, then with larger images; the
-    map of most images is kept.  With masks, which leave few features, the threshold is low at once.  The seed is
-    fixed.  lenses: a map whose lenses are kept.  Raises InputError where no two images can be matched.
+    registered it is tried again with a relaxed first pair, then with larger images; the map of most images is kept.
+    With masks, which leave few features, the first pair is relaxed at once.  The seed is fixed.  lenses: a map whose
+    lenses are kept.  Raises InputError where no two images can be matched.
     """
     best: Map | None = None
     attempts = [(MAP_SIDES[0], False), (MAP_SIDES[0], True), (MAP_SIDES[1], True)]
@@ -162,9 +164,7 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
         if masks is not None:
             _write(work / "masks" / f"{path}.png", _grown(masks[k]), scales[path])
     extraction = pycolmap.FeatureExtractionOptions()
-    extraction.sift.max_num_features = FEATURES
-    if relaxed:
-        extraction.sift.peak_threshold = LOW_PEAK
+    extraction.sift.max_num_features, extraction.sift.peak_threshold = FEATURES, LOW_PEAK
     pycolmap.Database.open(database).close()
     done = 0
     for k in range(len(lenses)):
@@ -188,15 +188,16 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
             group = names[first : first + 4]
             pycolmap.extract_features(database, images, group, reader_options=reader, extraction_options=extraction)
             done += len(group)
-    verification = pycolmap.TwoViewGeometryOptions()
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.sift.max_ratio, verification.ransac.max_num_trials = MATCH_RATIO, PAIR_TRIALS
     verification.ransac.random_seed = SEED  # else that of a pair depends on the thread that it meets
     progress("matching", 0, 1)
     if len(photos) <= EXHAUSTIVE:
-        pycolmap.match_exhaustive(database, verification_options=verification)
+        pycolmap.match_exhaustive(database, matching, verification_options=verification)
     else:
         pairing = pycolmap.SequentialPairingOptions()
         pairing.overlap, pairing.quadratic_overlap = 15, True  # offsets of 1 to 15, 16, 32, ...: these close loops
-        pycolmap.match_sequential(database, pairing_options=pairing, verification_options=verification)
+        pycolmap.match_sequential(database, matching, pairing, verification)
     options = pycolmap.IncrementalPipelineOptions(min_model_size=3, random_seed=SEED, extract_colors=False)
     options.num_threads = 1  # else the first pair of images depends on the threads, where few pairs are good
     if known:
@@ -218,6 +219,11 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
     if not models:
         return None
     largest = max(models.values(), key=lambda m: m.num_reg_images())
+    # Most matches lie on the support: the geometry that a pair has by itself is ambiguous and rejects matches on the
+    # object.  That of the map's cameras is not, and judges each match by itself: a pair needs only one.
+    options.min_num_matches = verification.min_num_inliers = 1
+    pycolmap.guided_geometric_verification(largest, database, two_view_geometry_options=verification)
+    largest = pycolmap.triangulate_points(largest, database, images, work / "sparse", options=options)
     with pycolmap.Database.open(database) as data:
         return _read_model(largest, data, by_path, scales)
 

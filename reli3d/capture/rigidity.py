@@ -44,7 +44,9 @@ def epipolar_fit(
         limit = EPIPOLAR_ERROR * max(first.photo.size) / min(first.focal, second.focal)
         cv2.setRNGSeed(0)
         _, own = cv2.findEssentialMat(x, y, np.eye(3), cv2.RANSAC, CONFIDENCE, limit)
-        best += 0 if own is None else int(np.count_nonzero(own))
+        if own is None or np.count_nonzero(own) < FEWEST_MATCHES:  # wrong matches alone fit some matrix, too
+            continue
+        best += int(np.count_nonzero(own))
         fitting += int((_sampson(x, y, _essential(first, second)) < limit).sum())
     return fitting / best if best else 1.0
 

@@ -26,8 +26,8 @@ def turned(points: np.ndarray, degrees: float) -> np.ndarray:
     return points @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [0.2, 0.1, 0]
 
 
-@pytest.mark.parametrize("moved", [False, True])
-def test_matches_on_a_moved_object_do_not_fit_the_cameras(moved):
+def object_map(moved: bool) -> tuple[Map, dict[str, np.ndarray]]:
+    """A map of an object that is moved after six of twelve views, or not, and of its surroundings; and its masks."""
     rng = np.random.default_rng(0)
     views, points = ring(), rng.uniform(-0.3, 0.3, (60, 3))
     surroundings = rng.uniform(-0.9, 0.9, (60, 3)) * (1, 1, 0.02) - (0, 0, 0.5)
@@ -40,13 +40,46 @@ def test_matches_on_a_moved_object_do_not_fit_the_cameras(moved):
         both = np.concatenate([shown, v.project(surroundings)[0]])
         pixels.append(both + rng.normal(0, 0.1, both.shape))
     matches = tuple((a, b, pixels[a], pixels[b]) for b in range(12) for a in range(b))
-    found = Map(tuple(views), np.zeros((0, 3)), np.zeros(0), np.zeros(0), matches)
+    return Map(tuple(views), np.zeros((0, 3)), np.zeros(0), np.zeros(0), matches), masks
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_matches_on_a_moved_object_do_not_fit_the_cameras(moved):
+    found, masks = object_map(moved)
     fit = epipolar_fit(found, masks)
     assert fit < 0.75 if moved else fit > 0.97  # 36 of 66 pairs are across the motion
     assert epipolar_fit(found, masks, inside=False) > 0.97
     passes = [Group(1.0, np.eye(3), np.zeros(3), tuple(str(k) for k in part)) for part in (range(6), range(6, 12))]
     between = epipolar_fit(found, masks, between=passes)
     assert between < 0.5 if moved else between > 0.97
+
+
+def test_wrong_matches_alone_are_no_motion():
+    rng, masks = np.random.default_rng(0), {str(k): np.full(SIZE[::-1], 255, np.uint8) for k in range(3)}
+    matches = tuple((a, b, *rng.uniform(0, SIZE, (2, 40, 2))) for b in range(3) for a in range(b))
+    assert epipolar_fit(Map(tuple(ring(3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), matches), masks) == 1.0
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_views_that_are_cut_off_are_not_the_reason_where_the_object_moves(moved, monkeypatch, tmp_path):
+    found, masks = object_map(moved)
+    for folder in ("photographs", "masks"):
+        (tmp_path / folder).mkdir()
+        for v, mask in zip(found.views, masks.values(), strict=True):
+            mask[0] = 255  # every mask touches the border
+            pixels = mask if folder == "masks" else v.photo.pixels
+            cv2.imwrite(str(tmp_path / folder / f"{v.photo.name}.png"), pixels)
+    maps = iter([found])
+
+    def mapped(*_):
+        if first := next(maps, None):
+            return first
+        raise InputError("photographs", "expected images that overlap")
+
+    monkeypatch.setattr(function, "map_photos", mapped)
+    options = function.CaptureOptions(masks=tmp_path / "masks", turntable=False)
+    with pytest.raises(InputError, match="something else moves" if moved else "step back"):
+        function.capture(tmp_path / "photographs", tmp_path / "object", options)
 
 
 def test_what_moves_around_the_object_is_left_out_of_a_second_map(monkeypatch):
