@@ -16,6 +16,7 @@ HUBER_DELTA = 0.25  # display values; larger residuals count linearly: reflected
 AGREEMENT_SIGMA = 0.1  # display values; larger differences at one point come from other surfaces or highlights
 BASE_COLOR_SCALE = 0.25  # logits; a larger change of base color corrects a wrong start, a smaller one may be shading
 PALETTE_SCALE = 0.5  # log base color; points that differ by more have different materials, not different shading
+LIGHT_PRIOR_VIEWS = 14  # views per lighting up to which the priors of the lighting have their full weight
 CHROMATICITY_SIGMA = 0.25  # log color without brightness: variation that colored light causes on one material
 
 
@@ -149,9 +150,14 @@ def hue_drift(color: Tensor, start: Tensor) -> Tensor:
 
 
 def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
-    """Priors that pull material, lighting and exposures to the start; the material's are divided by ``views``."""
+    """Priors that pull material, lighting and exposures to the start.
+
+    The material's are divided by ``views``.  The lighting's fall with the squared number of views per lighting above
+    ``LIGHT_PRIOR_VIEWS``: where the lighting is smoother than the true one, the roughness becomes too high.
+    """
     base, finish = ([grid[..., part] for grid in unknowns.material] for part in (slice(0, 3), slice(3, 5)))
     loss = weights.base_coarse / views * near_start(base) + weights.finish / views * near_start(finish)
-    loss = loss + weights.light * near_start(unknowns.light)
-    loss = loss + weights.light_variation * torch.stack([total_variation(m) for m in light_maps(unknowns.light)]).sum()
+    variation = torch.stack([total_variation(m) for m in light_maps(unknowns.light)]).sum()
+    light = weights.light * near_start(unknowns.light) + weights.light_variation * variation
+    loss = loss + min(1.0, LIGHT_PRIOR_VIEWS * len(unknowns.light[0]) / views) ** 2 * light
     return loss + weights.exposure * unknowns.exposure.square().mean()
