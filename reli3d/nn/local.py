@@ -22,12 +22,14 @@ from reli3d.geometry.camera import Camera, image_plane
 from reli3d.geometry.projection import gather_views
 from reli3d.kernels.view_features import CONFIDENT_WEIGHT
 from reli3d.nn.blocks import in_rows, linear_of
+from reli3d.nn.cost_volume import CostVolume
 from reli3d.nn.field import Field, PointMaterial, bound_sdf, grid_bound_sdf
 from reli3d.nn.heads import ROUGHNESS_MIN, color_logit, mlp
 from reli3d.nn.light_features import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.light_map import LightMap
 from reli3d.nn.presets import OFFSET_VIEWS, LocalPreset
 from reli3d.nn.pyramid import (
+    MIN_COVERAGE,
     ImagePyramid,
     depth_of_origin,
     pixel_hull_depths,
@@ -49,6 +51,7 @@ VIEW_WEIGHT = (
 HEAD_OUTPUTS = 13  # width of LocalField.heads
 NORMAL_RIGHT = -5  # of the pyramid's predictions: changes its sign under a left-right flip of the image
 METALLIC_LOGIT = -2.0  # where the prediction is zero
+MIN_CHANGED = 0.25  # weight of the nearest of four pixels whose depth the cost volume changes
 VIEW_WEIGHT_POWER = 2.0  # exponent of the blend weights: favors frontal views, with smooth seams
 
 
@@ -132,6 +135,7 @@ class LocalReconstructor(nn.Module):
         super().__init__()
         self.preset = preset
         self.pyramid = ImagePyramid(preset.pyramid)
+        self.cost_volume = CostVolume(preset.pyramid.features) if preset.cost_volume else None
         tokens = preset.pyramid.features + TOKEN_EXTRA
         self.volume = FeatureVolume(preset.volume, tokens)
         self.light = LightMap(preset.light)
@@ -240,7 +244,28 @@ class LocalReconstructor(nn.Module):
             turned[..., NORMAL_RIGHT] *= -1.0
             span = torch.cat([span, span[:mirrored].flip(2) + nearer[:, None, None, None]])
             features, raw = torch.cat([features, features[:mirrored].flip(2)]), torch.cat([raw, turned])
-        return features, PixelMaps.of(raw, span, coarse, mean), coarse
+        pixels = PixelMaps.of(raw, span, coarse, mean)
+        if self.cost_volume is not None and taken > 1:
+            depth = self._compared(pixels.of_views(taken), features[:taken], images, masks, span[:taken], read)
+            if mirrored:
+                depth = torch.cat([depth, depth[:mirrored].flip(2) + nearer[:, None, None, None]])
+            pixels = replace(pixels, depth=depth)
+        return features, pixels, coarse
+
+    def _compared(
+        self, pixels: PixelMaps, features: Tensor, images: Tensor, masks: Tensor, span: Tensor, camera: Camera
+    ) -> Tensor:
+        """Depths of ``pixels`` changed by the cost volume, which has half their resolution; finer differences stay."""
+        count = len(features)
+        quarter = camera.resized(features.shape[2], features.shape[1])
+        color, seen = pixel_colors(images[:count], masks[:count], quarter)
+        shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
+        shape = functional.avg_pool2d(shape, shape.shape[-1] // features.shape[2]).permute(0, 2, 3, 1)
+        depth, normal = shape[..., 0], functional.normalize(shape[..., 1:], dim=-1)
+        found = self.cost_volume(features, color, depth, normal, span, quarter, seen[..., 0])
+        change = torch.stack([found - depth, (seen[..., 0] > MIN_COVERAGE).to(depth)], 1)
+        change = functional.interpolate(change, size=pixels.depth.shape[1:3], mode="bilinear", align_corners=False)
+        return pixels.depth + (change[:, 0] / change[:, 1].clamp(min=MIN_CHANGED))[..., None]
 
     def _light(self, pixels: PixelMaps, color: Tensor, mask: Tensor, camera: Camera) -> Tensor:
         v, y, x = (mask > 0.9).nonzero(as_tuple=True)

@@ -190,6 +190,7 @@ class LocalPreset(_Checked):
     softness: float = 0.02  # unit of the signed distance: occupancy is sigmoid(-distance / softness)
     offset_one_view: float = 0.0  # outward offset of the surface, in units of softness; see reli3d.train.calibrate
     offset_many_views: float = 0.0  # the same for 1 / V = 0; with V views linear in 1 / min(V, OFFSET_VIEWS)
+    cost_volume: bool = False  # whether depths of pixels are refined by comparing the views
     smoothing: int = 8  # iterations of Taubin smoothing of the extracted surface
 
     def __post_init__(self):
@@ -324,4 +325,5 @@ SMALL = LocalPreset(
     view_width=40,
     head_width=64,
     resolution=96,
+    cost_volume=True,
 )

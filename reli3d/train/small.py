@@ -22,8 +22,11 @@ from reli3d.train.muon import Muon
 from reli3d.train.pixels import ViewCache, draw_group, is_pixel_parameter
 from reli3d.train.stage import Stage
 
-# Last layers start near zero and Adam's step is about the learning rate, so they train at a multiple of it
-LAST_LAYERS = (*(f"pyramid.says.{k}.1." for k in range(SMALL.pyramid.reading)), "color.4.", "surface.4.", "light.out.")
+# These layers start near zero, or without effect, and Adam's step is about the learning rate: they train at a multiple
+LAST_LAYERS = (
+    *(f"pyramid.says.{k}.1." for k in range(SMALL.pyramid.reading)),
+    *("color.4.", "surface.4.", "light.out.", "cost_volume."),
+)
 LAST_RATE = 10.0
 VALIDATION_OBJECTS = 3  # validation objects in the image, reconstructed from one and from four views
 LIST_EVERY = 50  # steps after which the folders are listed again: samples may be added during training

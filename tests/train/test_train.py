@@ -190,8 +190,8 @@ def test_every_parameter_is_in_one_group_and_last_layers_learn_faster():
     groups = parameter_groups(SmallStage(model, []), 0.02)
     times = {id(p): (group["times"], group["weight_decay"]) for group in groups for p in group["params"]}
     assert len(times) == sum(len(group["params"]) for group in groups) == len(list(model.parameters()))
-    last = (*(head[-1] for head in model.pyramid.says.values()), model.light.out, model.color[-1], model.surface[-1])
-    fast = {id(p) for layer in last for p in layer.parameters()}
+    heads = (head[-1] for head in (*model.pyramid.says.values(), model.color, model.surface))
+    fast = {id(p) for part in (*heads, model.light.out, model.cost_volume) for p in part.parameters()}
     for p in model.parameters():
         assert times[id(p)] == (LAST_RATE if id(p) in fast else 1.0, 0.02 if p.ndim > 1 else 0.0)
     slow = {id(p) for name, p in model.pyramid.named_parameters() if not name.startswith("features")}
