@@ -26,7 +26,8 @@ def epipolar_fit(
 
     About 1 where the object did not move relative to the features of the map.  Where it was moved the matches of a
     pair still fit an essential matrix of their own, but not that of the map's cameras.  inside: False takes the matches
-    outside the masks instead.  between: only pairs of views that are not in one of these groups.  1 without matches.
+    outside the masks instead.  between: only pairs of views that are not in one of these groups.  1 if no pair has
+    FEWEST_MATCHES inliers.
     """
     group_of = {name: k for k, group in enumerate(between or ()) for name in group.names}
     fitting, best = 0, 0

@@ -152,8 +152,8 @@ def hue_drift(color: Tensor, start: Tensor) -> Tensor:
 def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
     """Priors that pull material, lighting and exposures to the start.
 
-    The material's are divided by ``views``.  The lighting's fall with the squared number of views per lighting above
-    ``LIGHT_PRIOR_VIEWS``: where the lighting is smoother than the true one, the roughness becomes too high.
+    The material's are divided by ``views``.  The lighting's are multiplied by ``(LIGHT_PRIOR_VIEWS / n)**2`` if the
+    number n of views per lighting exceeds it: a lighting smoother than the true one biases roughness upwards.
     """
     base, finish = ([grid[..., part] for grid in unknowns.material] for part in (slice(0, 3), slice(3, 5)))
     loss = weights.base_coarse / views * near_start(base) + weights.finish / views * near_start(finish)

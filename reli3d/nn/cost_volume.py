@@ -14,70 +14,80 @@ from reli3d.nn.pyramid import MIN_COVERAGE, depth_of_origin
 
 STEPS = (0.006, 0.012, 0.024, 0.048, 0.096, 0.16)  # world units, about log-uniform as the errors have long tails
 OFFSETS = (*(-s for s in reversed(STEPS)), 0.0, *STEPS)  # of the hypotheses from the predicted depth
-PRIOR_DECAY = 0.06  # distance over which the initial probability of an offset falls by e
+PRIOR_DECAY = 0.06  # distance over which the initial probability of an offset falls by a factor of e
 CHANNELS, GROUPS = 16, 4  # compared features of a pixel, and groups that each give one correlation
 NEIGHBORS = 5  # views that a pixel is compared with, those of the closest directions
-HIDDEN, POOLED, REGULAR = 16, 8, 8  # widths of the layers on pairs, of their mean, of the 3D convolutions
-PAIR_NUMBERS, OWN_NUMBERS = 5, 5  # of a hypothesis in another view, and in its own
+PAIR_WIDTH, POOLED_WIDTH, CONV_WIDTH = 16, 8, 8  # widths of the layers on pairs, of their mean, of the 3D convolutions
+PAIR_FEATURES, OWN_FEATURES = 5, 5  # of a hypothesis in another view, and in its own
 NEAR_DISTANCE, FAR_DISTANCE = 0.05, 0.2  # scales of distances along a ray, world units
 
 
 class CostVolume(nn.Module):
     """Depth of the pixels of several views: the expectation over hypotheses compared between the views.
 
-    At first the scores of hypotheses before and behind the predicted depth are equal, so that it is returned.
+    At initialization offsets of either sign have equal scores, so that the predicted depth is returned.
     """
 
     def __init__(self, features: int):
         super().__init__()
         self.match = nn.Sequential(nn.Conv2d(features + 3, 32, 3, padding=1), nn.SiLU(), nn.Conv2d(32, CHANNELS, 1))
-        self.pair = nn.Sequential(nn.Linear(GROUPS + PAIR_NUMBERS, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, POOLED + 1))
+        self.pair = nn.Sequential(
+            nn.Linear(GROUPS + PAIR_FEATURES, PAIR_WIDTH), nn.SiLU(), nn.Linear(PAIR_WIDTH, POOLED_WIDTH + 1)
+        )
         self.regular = nn.Sequential(
-            nn.Conv3d(POOLED + OWN_NUMBERS, REGULAR, 3, padding=1),
+            nn.Conv3d(POOLED_WIDTH + OWN_FEATURES, CONV_WIDTH, 3, padding=1),
             nn.SiLU(),
-            nn.Conv3d(REGULAR, REGULAR, 3, padding=1),
+            nn.Conv3d(CONV_WIDTH, CONV_WIDTH, 3, padding=1),
             nn.SiLU(),
-            nn.Conv3d(REGULAR, 1, 3, padding=1),
+            nn.Conv3d(CONV_WIDTH, 1, 3, padding=1),
         )
         self.prior = nn.Parameter(-torch.tensor(OFFSETS).abs() / PRIOR_DECAY)
         nn.init.zeros_(self.regular[4].weight)
         nn.init.zeros_(self.regular[4].bias)
 
     def forward(
-        self, features: Tensor, color: Tensor, depth: Tensor, normal: Tensor, span: Tensor, camera: Camera, seen: Tensor
+        self,
+        features: Tensor,
+        color: Tensor,
+        depth: Tensor,
+        normal: Tensor,
+        span: Tensor,
+        camera: Camera,
+        coverage: Tensor,
     ) -> Tensor:
-        """Depth ``(V, Q, Q)`` relative to the world origin's, of ``V`` > 1 views; ``depth`` where ``seen`` is small.
+        """Depth ``(V, Q, Q)`` relative to the world origin's, of ``V`` > 1 views; ``depth`` where nothing is covered.
 
         features: ``(V, Q, Q, F)``.  color: ``(V, Q, Q, 3)`` sRGB.  depth, normal: ``(V, Q, Q)`` and ``(V, Q, Q, 3)``,
         predicted per view.  span: ``(V, Q, Q, 2)`` from :func:`~reli3d.nn.pyramid.pixel_hull_depths`.  camera: of
-        ``Q`` by ``Q`` pixels.  seen: ``(V, Q, Q)``, coverage.  Gradients reach features, color, depth, normal and
-        every parameter.
+        ``Q`` by ``Q`` pixels.  coverage: ``(V, Q, Q)``.  Gradients reach features, color, depth, normal and
+        every parameter but the last bias, which has no effect.
         """
         match = self.match(torch.cat([features, color], -1).permute(0, 3, 1, 2)).unflatten(1, (GROUPS, -1))
         match = functional.normalize(match, dim=2).flatten(1, 2).permute(0, 2, 3, 1)
-        covered = (seen > 0.5).to(depth)
+        covered = (coverage > 0.5).to(depth)
         maps = torch.cat([match, torch.stack([depth * covered, covered], -1)], -1)
-        close = functional.normalize(camera.c2w[:, :3, 3], dim=-1)
-        order = (close @ close.T).fill_diagonal_(-2.0).argsort(dim=1, descending=True, stable=True)
+        toward = functional.normalize(camera.c2w[:, :3, 3], dim=-1)
+        cosine = (toward @ toward.T * 1e4).round()  # so that ties do not depend on the device
+        order = cosine.fill_diagonal_(-2e4).argsort(dim=1, descending=True, stable=True)
         shape = torch.cat([depth[..., None], span, normal], -1)
-        where = seen > MIN_COVERAGE
+        valid = coverage > MIN_COVERAGE
         dense = [
-            self._numbers(view, others, maps, shape[view], camera, where[view])
+            self._hypothesis_features(view, others, maps, shape[view], camera, valid[view])
             for view, others in enumerate(order[:, :-1][:, :NEIGHBORS].tolist())
         ]
         volume = torch.stack(dense).permute(0, 4, 3, 1, 2).contiguous(memory_format=torch.channels_last_3d)
         score = self.regular(volume)[:, 0].permute(0, 2, 3, 1) + self.prior
-        return depth + (score.softmax(-1) * score.new_tensor(OFFSETS)).sum(-1) * where
+        return depth + (score.softmax(-1) * score.new_tensor(OFFSETS)).sum(-1) * valid
 
-    def _numbers(
-        self, view: int, others: list[int], maps: Tensor, shape: Tensor, camera: Camera, where: Tensor
+    def _hypothesis_features(
+        self, view: int, others: list[int], maps: Tensor, shape: Tensor, camera: Camera, valid: Tensor
     ) -> Tensor:
-        """Input of the 3D convolutions for one view, ``(Q, Q, K, C)``, zero except at the pixels ``where``.
+        """Input of the 3D convolutions for one view, ``(Q, Q, K, C)``, zero except at the pixels ``valid``.
 
         maps: ``(V, Q, Q, CHANNELS + 2)``: features, depth times coverage, coverage.  shape: ``(Q, Q, 6)``: depth, span
         and normal.
         """
-        pixels, c2w, origin = where.nonzero(as_tuple=True), camera.c2w, depth_of_origin(camera.c2w)
+        pixels, c2w, origin = valid.nonzero(as_tuple=True), camera.c2w, depth_of_origin(camera.c2w)
         depth, near, far, normal = shape[pixels].split([1, 1, 1, 3], -1)
         offsets = depth.new_tensor(OFFSETS)
         at = depth + offsets
@@ -93,7 +103,9 @@ class CostVolume(nn.Module):
         back = -functional.normalize(ray, dim=-1)
         facing, angle = ((toward * t[:, None, None]).sum(-1, keepdim=True) for t in (normal, back))
         ahead = [(ahead / NEAR_DISTANCE).tanh() * shown, (ahead / FAR_DISTANCE).tanh() * shown]
-        layers, weight = self.pair(torch.cat([correlation, *ahead, shown, facing, angle], -1)).split([POOLED, 1], -1)
+        layers, weight = self.pair(torch.cat([correlation, *ahead, shown, facing, angle], -1)).split(
+            [POOLED_WIDTH, 1], -1
+        )
         own = [
             ((at - near) / NEAR_DISTANCE).tanh(),
             ((far - at) / NEAR_DISTANCE).tanh(),
@@ -101,5 +113,5 @@ class CostVolume(nn.Module):
             (normal * back).sum(-1, keepdim=True).expand_as(at),
             torch.ones_like(at),
         ]
-        numbers = torch.cat([(layers * weight.softmax(2)).sum(2), torch.stack(own, -1)], -1)
-        return numbers.new_zeros(*where.shape, *numbers.shape[1:]).index_put(pixels, numbers)
+        found = torch.cat([(layers * weight.softmax(2)).sum(2), torch.stack(own, -1)], -1)
+        return found.new_zeros(*valid.shape, *found.shape[1:]).index_put(pixels, found)

@@ -1,6 +1,7 @@
 """The small network: convolutions over each view, over space and over the sphere of directions.
 
-A 2D U-Net predicts base color, normal and depth per pixel of every view (``pyramid``); a 3D U-Net pools the views over
+A 2D U-Net predicts base color, normal and depth per pixel of every view (``pyramid``); depths are refined by comparing
+the views (``cost_volume``); a 3D U-Net pools the views over
 the volume of the object (``volume``); a U-Net on lat-long maps completes the environment from the radiance that the
 surface reflects (``light_map``).  Small MLPs evaluate points from all three.  Positions enter only relative to the
 views and to the object.
@@ -51,13 +52,13 @@ VIEW_WEIGHT = (
 HEAD_OUTPUTS = 13  # width of LocalField.heads
 NORMAL_RIGHT = -5  # of the pyramid's predictions: changes its sign under a left-right flip of the image
 METALLIC_LOGIT = -2.0  # where the prediction is zero
-MIN_CHANGED = 0.25  # weight of the nearest of four pixels whose depth the cost volume changes
+MIN_INTERPOLATION_WEIGHT = 0.25  # sum of the bilinear weights of covered pixels below which a correction fades out
 VIEW_WEIGHT_POWER = 2.0  # exponent of the blend weights: favors frontal views, with smooth seams
 
 
 @dataclass(frozen=True)
 class PixelMaps:
-    """Predictions of the pyramid per pixel, at half the views' resolution."""
+    """Predictions per pixel at half the views' resolution, of the pyramid; depths as the cost volume changes them."""
 
     gain: Tensor  # (V, P, P, 1) of the mean logit of the observed color: 0 where a highlight hides the base color
     shift: Tensor  # (V, P, P, 3) of the color logits
@@ -160,8 +161,8 @@ class LocalReconstructor(nn.Module):
         return torch.bfloat16 if self.pyramid.in_bfloat16 else torch.float32
 
     def to_compute(self, dtype: torch.dtype) -> LocalReconstructor:
-        """Sets the compute dtype of the 2D and 3D convolutions, float32 or bfloat16; parameters and results stay
-        float32.  Raises ValueError for another dtype.
+        """Sets the compute dtype of the U-Nets' convolutions, float32 or bfloat16; parameters, results and the cost
+        volume stay float32.  Raises ValueError for another dtype.
         """
         if dtype not in (torch.float32, torch.bfloat16):
             raise ValueError(f"dtype: expected float32 or bfloat16, got {dtype}")
@@ -185,7 +186,8 @@ class LocalReconstructor(nn.Module):
         4)`` OpenGL.  intrinsics: ``(V, 4)`` in pixels of ``images``.  detail: ``(V, D, D, 4)``, sRGB and signed
         silhouette distance in pixels, from which colors are read.  detail_intrinsics: ``(V, 4)`` in its pixels.
         mirrored: number of views at the end that are the first views, flipped left to right, with mirrored cameras;
-        they are used for shape and material, not for lighting.  Gradients reach every parameter.  Raises ValueError if
+        they are used for shape and material, not for lighting.  Gradients reach every parameter, those of the cost
+        volume with two or more input views.  Raises ValueError if
         more than half of the views are mirrored.
         """
         views = images, masks, c2w, intrinsics, detail, detail_intrinsics
@@ -224,7 +226,7 @@ class LocalReconstructor(nn.Module):
         detail_intrinsics: Tensor,
         mirrored: int = 0,
     ) -> tuple[Tensor, PixelMaps, Camera]:
-        """The per-view part of :meth:`encode`: features at a quarter of the resolution, predictions at half, and the
+        """The per-view maps of :meth:`encode`: features at a quarter of the resolution, predictions at half, and the
         cameras of the predictions.  The maps of mirror images are those of the input views, flipped.
         """
         if not 0 <= 2 * mirrored <= len(images):
@@ -246,26 +248,26 @@ class LocalReconstructor(nn.Module):
             features, raw = torch.cat([features, features[:mirrored].flip(2)]), torch.cat([raw, turned])
         pixels = PixelMaps.of(raw, span, coarse, mean)
         if self.cost_volume is not None and taken > 1:
-            depth = self._compared(pixels.of_views(taken), features[:taken], images, masks, span[:taken], read)
+            depth = self._refined_depth(pixels.of_views(taken), features[:taken], images, masks, span[:taken], read)
             if mirrored:
                 depth = torch.cat([depth, depth[:mirrored].flip(2) + nearer[:, None, None, None]])
             pixels = replace(pixels, depth=depth)
         return features, pixels, coarse
 
-    def _compared(
+    def _refined_depth(
         self, pixels: PixelMaps, features: Tensor, images: Tensor, masks: Tensor, span: Tensor, camera: Camera
     ) -> Tensor:
-        """Depths of ``pixels`` changed by the cost volume, which has half their resolution; finer differences stay."""
+        """Depth of ``pixels`` plus the cost volume's correction, upsampled bilinearly from half their resolution."""
         count = len(features)
         quarter = camera.resized(features.shape[2], features.shape[1])
-        color, seen = pixel_colors(images[:count], masks[:count], quarter)
+        color, coverage = pixel_colors(images[:count], masks[:count], quarter)
         shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
         shape = functional.avg_pool2d(shape, shape.shape[-1] // features.shape[2]).permute(0, 2, 3, 1)
         depth, normal = shape[..., 0], functional.normalize(shape[..., 1:], dim=-1)
-        found = self.cost_volume(features, color, depth, normal, span, quarter, seen[..., 0])
-        change = torch.stack([found - depth, (seen[..., 0] > MIN_COVERAGE).to(depth)], 1)
+        found = self.cost_volume(features, color, depth, normal, span, quarter, coverage[..., 0])
+        change = torch.stack([found - depth, (coverage[..., 0] > MIN_COVERAGE).to(depth)], 1)
         change = functional.interpolate(change, size=pixels.depth.shape[1:3], mode="bilinear", align_corners=False)
-        return pixels.depth + (change[:, 0] / change[:, 1].clamp(min=MIN_CHANGED))[..., None]
+        return pixels.depth + (change[:, 0] / change[:, 1].clamp(min=MIN_INTERPOLATION_WEIGHT))[..., None]
 
     def _light(self, pixels: PixelMaps, color: Tensor, mask: Tensor, camera: Camera) -> Tensor:
         v, y, x = (mask > 0.9).nonzero(as_tuple=True)

@@ -245,7 +245,7 @@ def from_json(text: str) -> Preset | LocalPreset:
         raise ValueError(f"preset: expected the JSON of a preset, got {error}") from None
     local = isinstance(values, dict) and "pyramid" in values
     if local and isinstance(values["pyramid"], dict) and values["pyramid"].get("material_bins") == 1:
-        del values["pyramid"]["material_bins"]  # in files of version 0.4 and before
+        del values["pyramid"]["material_bins"]  # in files of development versions after 0.3
     return _build(LocalPreset if local else Preset, values, "preset")
 
 

@@ -22,12 +22,12 @@ from reli3d.train.muon import Muon
 from reli3d.train.pixels import ViewCache, draw_group, is_pixel_parameter
 from reli3d.train.stage import Stage
 
-# These layers start near zero, or without effect, and Adam's step is about the learning rate: they train at a multiple
-LAST_LAYERS = (
+# They start near zero or without effect, and Adam's step is about the learning rate: AdamW at FAST_RATE times it
+FAST_PARAMETERS = (
     *(f"pyramid.says.{k}.1." for k in range(SMALL.pyramid.reading)),
     *("color.4.", "surface.4.", "light.out.", "cost_volume."),
 )
-LAST_RATE = 10.0
+FAST_RATE = 10.0
 VALIDATION_OBJECTS = 3  # validation objects in the image, reconstructed from one and from four views
 LIST_EVERY = 50  # steps after which the folders are listed again: samples may be added during training
 
@@ -99,7 +99,7 @@ class SmallStage(Stage):
         return losses(self.model, item)
 
     def rate_factor(self, parameter: str) -> float:
-        last = LAST_RATE if parameter.startswith(LAST_LAYERS) else 1.0
+        last = FAST_RATE if parameter.startswith(FAST_PARAMETERS) else 1.0
         return last * (self.pyramid_rate if is_pixel_parameter(parameter) else 1.0)
 
     def configuration(self) -> dict[str, Any]:

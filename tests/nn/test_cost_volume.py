@@ -80,40 +80,54 @@ def test_a_wrong_depth_of_a_textured_sphere_is_corrected(model, error):
     assert float(left.median()) < 0.02  # width of a pixel
 
 
-def test_depths_do_not_depend_on_the_order_of_views_and_on_the_world_axes(model):
+@pytest.fixture
+def random_model() -> CostVolume:
+    """Every path contributes."""
+    torch.manual_seed(2)
+    volume = CostVolume(4)
+    with torch.no_grad():
+        for parameter in volume.parameters():
+            parameter += 0.2 * torch.randn_like(parameter)
+    return volume
+
+
+def test_depths_do_not_depend_on_the_order_of_views_and_on_the_world_axes(random_model):
     views, turned = sphere_views(4), sphere_views(4, turn=1.0)
-    order, predicted = torch.tensor([2, 0, 3, 1]), torch.zeros(4, SIDE, SIDE)
+    order, predicted = torch.tensor([2, 0, 3, 1]), views["truth"] + 0.05 * torch.randn(4, SIDE, SIDE)
     exchanged = {name: value[order] for name, value in views.items()}
     with torch.no_grad():
-        want = found(model, views, predicted)
-        torch.testing.assert_close(found(model, exchanged, predicted), want[order], rtol=0, atol=1e-4)
-        torch.testing.assert_close(found(model, turned, predicted), want, rtol=0, atol=1e-3)  # scores times 40
+        want = found(random_model, views, predicted)
+        torch.testing.assert_close(found(random_model, exchanged, predicted[order]), want[order], rtol=0, atol=1e-5)
+        torch.testing.assert_close(found(random_model, turned, predicted), want, rtol=0, atol=1e-4)  # float32 rotation
+    assert (want - predicted)[inner(views)].abs().mean() > 1e-3
 
 
-def test_at_first_and_outside_the_object_depths_are_those_predicted(model):
+def test_at_initialization_and_outside_the_object_depths_are_those_predicted(random_model):
     views = sphere_views(3)
     predicted = 0.1 + 0.1 * torch.rand(3, SIDE, SIDE)
     with torch.no_grad():
         torch.testing.assert_close(found(CostVolume(4), views, predicted), predicted, rtol=0, atol=1e-6)
-        got = found(model, views, predicted)
-    assert (got == predicted)[views["seen"] == 0].all() and not (got == predicted)[inner(views)].all()
+        got = found(random_model, views, predicted)
+    assert (got == predicted)[views["seen"] == 0].all()
+    assert (got != predicted)[inner(views)].float().mean() > 0.9
 
 
-def test_gradients_reach_inputs_and_parameters(model):
-    views = sphere_views(3)
+def test_gradients_reach_inputs_and_parameters(random_model):
+    model, views = random_model, sphere_views(3)
     inputs = {name: views[name].clone().requires_grad_() for name in ("color", "normal")}
-    predicted = views["truth"].clone().requires_grad_()
-    loss = (found(model, {**views, **inputs}, predicted) - views["truth"]).square().sum()
-    loss.backward()
-    # central difference of the loss in one parameter; float32 sums over some thousand pixels
+
+    def loss(views: dict) -> Tensor:
+        return (found(model, views, views["truth"]) - views["truth"]).square().sum()
+
+    loss({**views, **inputs}).backward()
     weight, step = model.match[2].weight, 1e-2
     index = tuple(int(k) for k in torch.unravel_index(weight.grad.abs().argmax(), weight.shape))
     values = []
-    for sign in (1.0, -1.0):
-        with torch.no_grad():
+    with torch.no_grad():
+        for sign in (1.0, -2.0):
             weight[index] += sign * step
-            values.append(float((found(model, views, views["truth"]) - views["truth"]).square().sum()))
-            weight[index] -= sign * step
+            values.append(float(loss(views)))
+    # a central difference of a float32 sum over some thousand pixels
     assert float(weight.grad[index]) == pytest.approx((values[0] - values[1]) / (2 * step), rel=0.05)
-    assert all(t.grad.abs().sum() > 0 for t in (*inputs.values(), predicted) if t is not inputs["normal"])
-    assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
+    without = {id(model.regular[4].bias)}  # it shifts all scores
+    assert all(t.grad.abs().sum() > 0 for t in (*inputs.values(), *model.parameters()) if id(t) not in without)

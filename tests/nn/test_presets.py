@@ -120,3 +120,15 @@ def test_the_largest_maps_of_a_preset_allocate_nothing_before_shapes_are_compare
     with torch.device("meta"):
         assert network(preset).environment.sample_directions.is_meta
     assert isinstance(from_json(to_json(SMALL)), LocalPreset)
+
+
+def test_a_preset_from_before_the_cost_volume_has_none():
+    values = json.loads(to_json(SMALL))
+    del values["cost_volume"]
+    values["pyramid"]["material_bins"] = 1  # written by development versions after 0.3
+    preset = from_json(json.dumps(values))
+    assert preset == dataclasses.replace(SMALL, cost_volume=False)
+    assert not any(name.startswith("cost_volume.") for name in shapes(preset))
+    values["pyramid"]["material_bins"] = 8
+    with pytest.raises(ValueError, match=r"preset\.pyramid\.material_bins: not a field of this version"):
+        from_json(json.dumps(values))

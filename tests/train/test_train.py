@@ -32,7 +32,7 @@ from reli3d.train.losses import (
     pattern_loss,
     perturbed,
 )
-from reli3d.train.small import LAST_RATE, PixelStage, SmallOptions, SmallStage
+from reli3d.train.small import FAST_RATE, PixelStage, SmallOptions, SmallStage
 from reli3d.train.stage import Options
 from reli3d.train.stages.latents import load_prior
 
@@ -185,7 +185,7 @@ def test_every_parameter_gets_a_gradient(samples):
         assert bool(torch.isfinite(p.grad).all()) and float(p.grad.abs().max()) > 0, name
 
 
-def test_every_parameter_is_in_one_group_and_last_layers_learn_faster():
+def test_every_parameter_is_in_one_group_and_some_learn_faster():
     model = LocalReconstructor(SMALL)
     groups = parameter_groups(SmallStage(model, []), 0.02)
     times = {id(p): (group["times"], group["weight_decay"]) for group in groups for p in group["params"]}
@@ -193,7 +193,7 @@ def test_every_parameter_is_in_one_group_and_last_layers_learn_faster():
     heads = (head[-1] for head in (*model.pyramid.says.values(), model.color, model.surface))
     fast = {id(p) for part in (*heads, model.light.out, model.cost_volume) for p in part.parameters()}
     for p in model.parameters():
-        assert times[id(p)] == (LAST_RATE if id(p) in fast else 1.0, 0.02 if p.ndim > 1 else 0.0)
+        assert times[id(p)] == (FAST_RATE if id(p) in fast else 1.0, 0.02 if p.ndim > 1 else 0.0)
     slow = {id(p) for name, p in model.pyramid.named_parameters() if not name.startswith("features")}
     for group in parameter_groups(SmallStage(model, [], SmallOptions(pyramid_rate=0.1)), 0.02):
         for p in group["params"]:
