@@ -34,16 +34,16 @@ class CostVolume(nn.Module):
         self.pair = nn.Sequential(
             nn.Linear(GROUPS + PAIR_FEATURES, PAIR_WIDTH), nn.SiLU(), nn.Linear(PAIR_WIDTH, POOLED_WIDTH + 1)
         )
+        last = nn.Conv3d(CONV_WIDTH, 1, 3, padding=1)
+        nn.init.zeros_(last.weight)
         self.regular = nn.Sequential(
             nn.Conv3d(POOLED_WIDTH + OWN_FEATURES, CONV_WIDTH, 3, padding=1),
             nn.SiLU(),
             nn.Conv3d(CONV_WIDTH, CONV_WIDTH, 3, padding=1),
             nn.SiLU(),
-            nn.Conv3d(CONV_WIDTH, 1, 3, padding=1),
+            last,
         )
         self.prior = nn.Parameter(-torch.tensor(OFFSETS).abs() / PRIOR_DECAY)
-        nn.init.zeros_(self.regular[4].weight)
-        nn.init.zeros_(self.regular[4].bias)
 
     def forward(
         self,

@@ -248,26 +248,13 @@ class LocalReconstructor(nn.Module):
             features, raw = torch.cat([features, features[:mirrored].flip(2)]), torch.cat([raw, turned])
         pixels = PixelMaps.of(raw, span, coarse, mean)
         if self.cost_volume is not None and taken > 1:
-            depth = self._refined_depth(pixels.of_views(taken), features[:taken], images, masks, span[:taken], read)
+            depth = _refined_depth(
+                self.cost_volume, pixels.of_views(taken), features[:taken], images, masks, span[:taken], read
+            )
             if mirrored:
                 depth = torch.cat([depth, depth[:mirrored].flip(2) + nearer[:, None, None, None]])
             pixels = replace(pixels, depth=depth)
         return features, pixels, coarse
-
-    def _refined_depth(
-        self, pixels: PixelMaps, features: Tensor, images: Tensor, masks: Tensor, span: Tensor, camera: Camera
-    ) -> Tensor:
-        """Depth of ``pixels`` plus the cost volume's correction, upsampled bilinearly from half their resolution."""
-        count = len(features)
-        quarter = camera.resized(features.shape[2], features.shape[1])
-        color, coverage = pixel_colors(images[:count], masks[:count], quarter)
-        shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
-        shape = functional.avg_pool2d(shape, shape.shape[-1] // features.shape[2]).permute(0, 2, 3, 1)
-        depth, normal = shape[..., 0], functional.normalize(shape[..., 1:], dim=-1)
-        found = self.cost_volume(features, color, depth, normal, span, quarter, coverage[..., 0])
-        change = torch.stack([found - depth, (coverage[..., 0] > MIN_COVERAGE).to(depth)], 1)
-        change = functional.interpolate(change, size=pixels.depth.shape[1:3], mode="bilinear", align_corners=False)
-        return pixels.depth + (change[:, 0] / change[:, 1].clamp(min=MIN_INTERPOLATION_WEIGHT))[..., None]
 
     def _light(self, pixels: PixelMaps, color: Tensor, mask: Tensor, camera: Camera) -> Tensor:
         v, y, x = (mask > 0.9).nonzero(as_tuple=True)
@@ -279,6 +266,22 @@ class LocalReconstructor(nn.Module):
         albedo = srgb_to_linear(logit.sigmoid())
         gloss = 1.0 - pixels.roughness[v, y, x, 0].sigmoid()
         return self.light(srgb_to_linear(observed), albedo, gloss, pixels.normal[v, y, x], wo)
+
+
+def _refined_depth(
+    volume: CostVolume, pixels: PixelMaps, features: Tensor, images: Tensor, masks: Tensor, span: Tensor, camera: Camera
+) -> Tensor:
+    """Depth of ``pixels`` plus the correction by ``volume``, upsampled bilinearly from half their resolution."""
+    count = len(features)
+    quarter = camera.resized(features.shape[2], features.shape[1])
+    color, coverage = pixel_colors(images[:count], masks[:count], quarter)
+    shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
+    shape = functional.avg_pool2d(shape, shape.shape[-1] // features.shape[2]).permute(0, 2, 3, 1)
+    depth, normal = shape[..., 0], functional.normalize(shape[..., 1:], dim=-1)
+    found = volume(features, color, depth, normal, span, quarter, coverage[..., 0])
+    change = torch.stack([found - depth, (coverage[..., 0] > MIN_COVERAGE).to(depth)], 1)
+    change = functional.interpolate(change, size=pixels.depth.shape[1:3], mode="bilinear", align_corners=False)
+    return pixels.depth + (change[:, 0] / change[:, 1].clamp(min=MIN_INTERPOLATION_WEIGHT))[..., None]
 
 
 def pixel_colors(images: Tensor, masks: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
