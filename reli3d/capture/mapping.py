@@ -23,9 +23,7 @@ from reli3d.errors import InputError
 FEATURES = 4096  # SIFT features of an image
 MAP_SIDES = 1000, 2000  # pixels along the longer side, first and where too few images are registered
 LOW_PEAK = 0.003  # SIFT's peak threshold: with its default, 0.0067, a dark object has 0.7 times the points
-MATCH_RATIO = (
-    0.85  # of the distances to the nearest and second descriptor: with 0.8 a dark object has 0.75 times the points
-)
+MATCH_RATIO = 0.85  # of nearest to second-nearest descriptor: with 0.8 a dark object has 0.75 times the points
 PAIR_TRIALS = 1000  # of RANSAC for a pair of images: most do not overlap; COLMAP's 10,000 make matching 4 times slower
 ENOUGH = 0.8  # fraction of the images whose registration needs no retry
 EXHAUSTIVE = 100  # images up to which each is matched with each

@@ -91,7 +91,7 @@ class CostVolume(nn.Module):
         depth, near, far, normal = shape[pixels].split([1, 1, 1, 3], -1)
         offsets = depth.new_tensor(OFFSETS)
         at = depth + offsets
-        right, up = (t[view][pixels] for t in image_plane(camera))
+        right, up = (t[pixels] for t in image_plane(camera[view]))
         ray = torch.stack([right, up, -torch.ones_like(right)], -1) @ c2w[view, :3, :3].T
         point = c2w[view, :3, 3] + ray[:, None] * (at + origin[view])[..., None]
         got, place = gather_views(maps[others].contiguous(), point.reshape(-1, 3).contiguous(), camera[others])

@@ -58,7 +58,7 @@ VIEW_WEIGHT_POWER = 2.0  # exponent of the blend weights: favors frontal views, 
 
 @dataclass(frozen=True)
 class PixelMaps:
-    """Predictions per pixel at half the views' resolution, of the pyramid; depths as the cost volume changes them."""
+    """Predictions of the pyramid per pixel, at half the views' resolution; depth is corrected by the cost volume."""
 
     gain: Tensor  # (V, P, P, 1) of the mean logit of the observed color: 0 where a highlight hides the base color
     shift: Tensor  # (V, P, P, 3) of the color logits
