@@ -185,7 +185,7 @@ def _read_video(path: Path, progress: Progress) -> tuple[list[Photo], list[str]]
     except InputError:
         raise
     except Exception as error:  # FFmpeg's errors have many classes
-        reason = shown(str(error))
+        reason = shown(getattr(error, "strerror", None) or str(error))
     notes = [f"{len(best)} sharp frames taken of {count} of the video"]
     if count < WHOLE_VIDEO * total:  # FFmpeg ends without an error where a file is cut off
         notes.append(f"only {count} of the {total} frames of the video can be decoded: the file is cut off or broken")
