@@ -181,16 +181,25 @@ def _gain(color: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Expected:
-    """The plane as a view shows it: lowest and highest color ``(H, W, 3)`` within a pixel, and spread ``(H, W)``."""
+    """The plane as a view shows it: color ``(H, W, 3)`` float32 and spread ``(H, W)``."""
 
-    low: np.ndarray  # uint8, as `high`
-    high: np.ndarray
+    color: np.ndarray
     spread: np.ndarray
     known: np.ndarray  # (H, W) bool
 
     def away(self, image: np.ndarray, gain: np.ndarray | float) -> np.ndarray:
-        """Distance ``(H, W, 3)`` of the colors of ``image`` from the plane's."""
-        return np.maximum(np.maximum(image - self.high * gain, self.low * gain - image), 0.0)
+        """Distance ``(H, W, 3)`` between the colors of ``image`` and the plane's, which may lie a pixel apart.
+
+        Each must occur in the other: any gray is among the colors of print within a pixel, but not the reverse.
+        """
+        image, plane = image.astype(np.float32), (self.color * gain).astype(np.float32)
+        return np.maximum(_outside(image, plane), _outside(plane, image))
+
+
+def _outside(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Distance ``(H, W, 3)`` of ``colors`` from the range of ``others`` within a pixel."""
+    window = np.ones((3, 3), np.uint8)
+    return np.maximum(np.maximum(colors - cv2.dilate(others, window), cv2.erode(others, window) - colors), 0.0)
 
 
 def _expected(texture: _Texture, axes: _Axes, small: _Small) -> _Expected:
@@ -202,11 +211,9 @@ def _expected(texture: _Texture, axes: _Axes, small: _Small) -> _Expected:
     hit = (eye[:2] + along[:, None] * rays[:, :2]) / texture.cell + len(texture.color) / 2 - 0.5
     hit[along <= 0] = -10
     u, v = hit.T.astype(np.float32).reshape(2, h, w)
-    color = np.rint(cv2.remap(texture.color, u, v, cv2.INTER_LINEAR)).astype(np.uint8)
+    color = cv2.remap(texture.color, u, v, cv2.INTER_LINEAR)
     spread = cv2.remap(texture.spread, u, v, cv2.INTER_LINEAR, borderValue=10 * MOST_SPREAD)
-    window = np.ones((3, 3), np.uint8)
-    known = spread < MOST_SPREAD
-    return _Expected(cv2.erode(color, window), cv2.dilate(color, window), np.maximum(spread, LEAST_SPREAD), known)
+    return _Expected(color, np.maximum(spread, LEAST_SPREAD), spread < MOST_SPREAD)
 
 
 class _Colors:
@@ -253,8 +260,7 @@ def _log_odds(image: np.ndarray, inside: np.ndarray, plane: _Expected, own: _Col
     near, around = (cv2.dilate(inside.astype(np.uint8), np.ones((k, k), np.uint8)) > 0 for k in NEAR_AND_AROUND)
     sample, gain = ~near & plane.known, np.ones(3)
     if sample.sum() > FEWEST_PIXELS:
-        middle = (plane.low[sample] + plane.high[sample].astype(float)) / 2
-        gain = np.median(image[sample] / np.maximum(middle, DARKEST), 0)
+        gain = np.median(image[sample] / np.maximum(plane.color[sample], DARKEST), 0)
     context = around & ~near
     other = _Colors(image[context if context.sum() > FEWEST_PIXELS else ~inside]).log_density(image)
     as_plane = -0.5 * (plane.away(image, gain) ** 2).sum(-1) / plane.spread**2

@@ -88,6 +88,15 @@ def test_masks_of_a_pixel_leave_no_colors_and_are_accepted():
     assert {k: v.shape for k, v in fused_masks(found, scene, masks).items()} == {k: v.shape for k, v in masks.items()}
 
 
+def test_a_smooth_surface_in_front_of_print_is_not_the_plane():
+    """Its gray is among the colors of the print within a pixel; the print is not among its grays."""
+    text = np.random.default_rng(0).choice(np.float32([20, 230]), (40, 40, 1)).repeat(3, 2)
+    plane = fusion._Expected(text, np.full((40, 40), 3.0), np.ones((40, 40), bool))
+    assert plane.away(np.full((40, 40, 3), 125, np.uint8), 1.0).min() > 100
+    assert plane.away(np.roll(text, (1, -1), (0, 1)).astype(np.uint8), 1.0)[1:-1, 1:-1].max() == 0  # a pixel apart
+    assert plane.away((0.5 * text).astype(np.uint8), 0.5).max() == 0
+
+
 def test_texels_that_enough_views_show_outside_the_masks_have_the_colors_of_the_plane():
     """Two low parts, missing in the cover: the first is in the masks of 6 of 10 views, the other in those of 7."""
     plane, part, radius, at = 100, 200, 0.15, ((-0.4, 0.0), (0.4, 0.0))
