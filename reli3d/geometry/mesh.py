@@ -4,14 +4,13 @@ Faces are counter-clockwise seen from outside.  Topology (components, report) re
 vertices at bit-identical positions are merged, because atlases and exporters split the vertices of a connected surface.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check, tensor_of
+from reli3d._bridge import Movable, check, tensor_of
 from reli3d.geometry.tangents import vertex_tangents
 from reli3d.geometry.topology import edges_of, graph_components, weld_rows
 
@@ -19,7 +18,7 @@ NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below whic
 
 
 @dataclass(frozen=True)
-class Mesh:
+class Mesh(Movable):
     """Triangle mesh on one device, with optional vertex attributes.
 
     vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32, counter-clockwise seen from outside.  normals: ``(V, 3)``
@@ -48,18 +47,6 @@ class Mesh:
             value = getattr(self, name)
             if value is not None:
                 check(name, value, shape=(len(self.vertices), last), like=self.vertices)
-
-    def to(self, device: torch.device | str) -> "Mesh":
-        """The same mesh on another device."""
-        return self._changed(lambda value: value.to(device))
-
-    def detach(self) -> "Mesh":
-        """The same mesh without gradients."""
-        return self._changed(lambda value: value.detach())
-
-    def _changed(self, change: Callable[[Tensor], Tensor]) -> "Mesh":
-        present = {f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None}
-        return Mesh(**{name: change(value) for name, value in present.items()})
 
     def with_normals(self) -> "Mesh":
         """The same mesh with :func:`vertex_normals`."""

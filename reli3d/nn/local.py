@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from reli3d._bridge import mapped
 from reli3d.geometry.camera import Camera, image_plane
 from reli3d.geometry.projection import gather_views
 from reli3d.kernels.view_features import CONFIDENT_WEIGHT
@@ -71,7 +72,7 @@ class PixelMaps:
 
     def of_views(self, count: int) -> PixelMaps:
         """The maps of the first ``count`` views."""
-        return PixelMaps(**{f.name: getattr(self, f.name)[:count] for f in fields(self)})
+        return mapped(self, lambda values: values[:count])
 
     @staticmethod
     def of(raw: Tensor, span: Tensor, camera: Camera, mean: Tensor) -> PixelMaps:
