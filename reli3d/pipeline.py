@@ -31,7 +31,7 @@ from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import source_vertices, unwrap, unwrap_xatlas
 from reli3d.nn.blocks import in_rows, submit
-from reli3d.nn.field import CHUNK, Field, TriplaneField
+from reli3d.nn.field import CHUNK, TriplaneField
 from reli3d.nn.local import HEAD_OUTPUTS, VIEW_WEIGHT, LocalField, LocalReconstructor
 from reli3d.nn.presets import CALIBRATED_VIEWS, LocalPreset, Preset
 from reli3d.nn.view_features import ViewMaps
@@ -60,6 +60,8 @@ OUTSIDE_FIELD = 1.0  # field value of grid points outside the visual hull
 NORMAL_LENGTH = 0.03  # model units: up to four views, predicted normals determine the shape of smaller features
 NORMAL_WEIGHT, MAX_NORMAL_WEIGHT = 8.0, 3.0  # of predicted normals; divided by the number of views
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
+
+Field = LocalField | TriplaneField  # network output for one object
 
 
 class NoSurface(InputError):
@@ -93,8 +95,6 @@ def extract(field: Field, resolution: int) -> Mesh:
         mesh = largest_components(_bounded_surface(field, resolution), MIN_PART_FRACTION)
         mesh = taubin_smooth(mesh, iterations=field.model.preset.smoothing)  # predictions are noisy between cells
         return _with_predicted_normals(field, replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)))
-    if not isinstance(field, TriplaneField):
-        raise TypeError(f"field: expected LocalField or TriplaneField, got {type(field).__name__}")
     mesh = largest_components(_free_surface(field, resolution), MIN_PART_FRACTION)
     return replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces))
 
@@ -202,8 +202,8 @@ def texture(
             heads, corners = values[0].split([HEAD_OUTPUTS, len(maps.images)], 1)
             visible = maps.visibility_within(present("scene", scene), position, normal, corners)
             got = local.material_from_heads(heads, position, normal, visible)
-        else:
-            got = field.material(position, normal, position.new_zeros(len(position), len(maps.images)))
+        elif isinstance(field, TriplaneField):
+            got = field.material(position, normal)
         found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
         return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 
@@ -393,7 +393,7 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
     with watch.stage("surface"):
         mesh = extract(field, options.resolution or model.preset.resolution)
     with watch.stage("textures"):
-        scene = RayScene(mesh.vertices, mesh.faces) if field.reads_views else None
+        scene = RayScene(mesh.vertices, mesh.faces) if isinstance(field, LocalField) else None
         mesh, textures = texture(field, mesh, options.texture_size, scene, uv=options.uv)
     with watch.stage("light"):
         asset = Asset(mesh, textures, light(field))
