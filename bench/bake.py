@@ -4,7 +4,7 @@ import torch
 import trimesh
 from scipy import ndimage
 
-from reli3d.geometry.bake import bake, dilate, rasterize_texels
+from reli3d.geometry.bake import bake, nearest_valid, rasterize_texels
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import unwrap
@@ -38,7 +38,7 @@ def filling(device, subdivisions, size):
     """Nine channels filled from the nearest valid texel."""
     valid = rasterize_texels(sphere(device, subdivisions, size), size).valid
     maps = torch.rand(size, size, 9, device=device)
-    return lambda: dilate(maps, valid), {"texels": size * size}
+    return lambda: maps.view(-1, 9)[nearest_valid(valid)[0].view(-1).long()], {"texels": size * size}
 
 
 def scipy_filling(device, subdivisions, size):

@@ -6,7 +6,6 @@ T, (row + 0.5) / T).  No gradients.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import overload
 
 import numpy as np
 import torch
@@ -115,26 +114,6 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     return Texels(face, bary, distance == 0.0)
 
 
-def interpolate(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions and unit normals ``(N, 3)`` at the valid texels with flat int64 indices ``index (N,)``.
-
-    Where the normals of a face cancel, the normal of its vertex 0.
-    """
-    return _positions_normals(mesh, *_checked_corners(mesh, texels, index))
-
-
-def interpolate_tangents(mesh: Mesh, texels: Texels, index: Tensor) -> Tensor:
-    """Unit tangents with the sign of vertex 0, ``(N, 4)``; arguments as in :func:`interpolate`."""
-    return _tangents(mesh, *_checked_corners(mesh, texels, index))
-
-
-def _checked_corners(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
-    check("index", index, dtype=torch.int64, like=texels.bary)
-    if index.ndim != 1 or (len(index) and not bool((texels.face.reshape(-1)[index] >= 0).all())):
-        raise ValueError("index: expected a list of valid texels, got others")
-    return _corner_weights(mesh, texels, index)
-
-
 def _corner_weights(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
     """Vertices of the faces at the texels of ``index`` and their weights, both ``(N, 3)``."""
     bary = texels.bary.reshape(-1, 2)[index]
@@ -224,12 +203,13 @@ def bake(
                 if value.shape[1] != maps[name].shape[1]:
                     raise ValueError(f"fn()[{name!r}]: expected {maps[name].shape[1]} channels, got {value.shape[1]}")
                 maps[name][part] = value
-    result = {name: value.view(size, size, -1) for name, value in maps.items()}
     if fill:
-        nearest = nearest_valid(texels.valid)
-        for value in result.values():
-            _fill(value, *nearest)
-    return result
+        source, square = nearest_valid(texels.valid)
+        rows = (square > 0.0).reshape(-1).nonzero().squeeze(1)
+        nearest = source.reshape(-1)[rows]
+        for value in maps.values():
+            value.index_copy_(0, rows, value.index_select(0, nearest))
+    return {name: value.view(size, size, -1) for name, value in maps.items()}
 
 
 def nearest_valid(valid: Tensor) -> tuple[Tensor, Tensor]:
@@ -249,41 +229,3 @@ def nearest_valid(valid: Tensor) -> tuple[Tensor, Tensor]:
     )
     _bridge.launch(kernels.nearest_texel_kernel, h, [row, site, border, source, square], device, slice_min=ROWS_MIN)
     return source, square
-
-
-@overload
-def dilate(maps: Tensor, valid: Tensor, *, iterations: int | None = None) -> Tensor: ...
-@overload
-def dilate(maps: Mapping[str, Tensor], valid: Tensor, *, iterations: int | None = None) -> dict[str, Tensor]: ...
-def dilate(
-    maps: Mapping[str, Tensor] | Tensor, valid: Tensor, *, iterations: int | None = None
-) -> dict[str, Tensor] | Tensor:
-    """Fills every texel of ``maps`` that is not ``valid`` with the value of the nearest valid texel.
-
-    maps: ``(H, W, C)`` float32, or a dictionary of such maps; not modified.  valid: ``(H, W)`` bool.  iterations: fill
-    only up to this distance [texels]; None fills all texels, so that no mip level contains an unwritten texel.  Ties go
-    to the upper row, then the left column.
-    """
-    if iterations is not None and iterations < 0:
-        raise ValueError(f"iterations: expected None or at least 0, got {iterations}")
-    source, square = nearest_valid(valid)
-    limit = float("inf") if iterations is None else float(iterations) ** 2
-
-    def filled(name: str, value: Tensor) -> Tensor:
-        check(name, value, like=valid)
-        if value.ndim != 3 or value.shape[:2] != valid.shape:
-            raise ValueError(f"{name}: expected shape {(*valid.shape, 'C')}, got {tuple(value.shape)}")
-        result = value.detach().clone(memory_format=torch.contiguous_format)
-        _fill(result, source, square, limit)
-        return result
-
-    if isinstance(maps, Tensor):
-        return filled("maps", maps)
-    return {name: filled(f"maps[{name!r}]", value) for name, value in maps.items()}
-
-
-def _fill(value: Tensor, source: Tensor, square: Tensor, limit: float = float("inf")) -> None:
-    """Copy texels of ``value (H, W, C)``, in place, from those that :func:`nearest_valid` found within ``limit``."""
-    flat = value.view(-1, value.shape[2])
-    rows = ((source >= 0) & (square > 0.0) & (square <= limit)).reshape(-1).nonzero().squeeze(1)
-    flat.index_copy_(0, rows, flat.index_select(0, source.reshape(-1)[rows]))

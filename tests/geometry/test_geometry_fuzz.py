@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from reli3d.geometry.bake import Texels, interpolate, interpolate_tangents
+from reli3d.geometry.bake import Texels, bake
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import hull_distance
 from reli3d.geometry.mesh import Mesh, vertex_normals
@@ -251,9 +251,8 @@ def test_interpolation_of_texels(device):
     bary[::3] = corner[torch.arange(len(bary[::3])) % 5]
     face = torch.arange(size * size, dtype=torch.int32)
     texels = Texels(face.view(size, size).to(device), bary.view(size, size, 2).to(device), (face >= 0).view(size, size))
-    index = torch.arange(size * size, device=device)
-    position, normal = interpolate(mesh, texels, index)
-    along = interpolate_tangents(mesh, texels, index)
+    values = bake(mesh, size, lambda *at: torch.cat(at, 1), texels=texels, tangents=True)["value"]
+    position, normal, along = values.view(-1, 10).split([3, 3, 4], 1)
     assert finite(position, normal, along)
     ones = torch.ones(size * size)
     torch.testing.assert_close(normal.norm(dim=1).cpu(), ones, rtol=0, atol=1e-6)
