@@ -301,12 +301,6 @@ CASES = {
         lambda n: {"radiance": uniform(8, 16, 3, seed=1), "directions": units(n, 2)},
         lambda radiance, directions: (Environment(radiance).lookup(directions),), ("radiance", "directions"),
         ("directions",)),
-    "SphericalGaussians.lookup": Case(
-        lambda n: lobes(n, "directions"), lambda directions, **g: (SphericalGaussians(**g).lookup(directions),),
-        (*SG, "directions"), ("directions",)),
-    "SphericalGaussians.irradiance": Case(
-        lambda n: lobes(n, "normals"), lambda normals, **g: (SphericalGaussians(**g).irradiance(normals),),
-        (*SG, "normals"), ("normals",)),
     "shade_gaussians": Case(
         lambda n: {**lobes(n, "normal"), **{k: v for k, v in shaded(n).items() if k != "radiance"},
                    "wo": normalize(units(n, 1) + 0.5 * units(n, 6), dim=-1)},
