@@ -221,9 +221,3 @@ def watertight(mesh: Mesh) -> bool:
     """Whether the mesh has faces and every edge has an even number of them; only this field of :func:`report`."""
     faces, sound = welded_faces(mesh)
     return bool(sound.any() and (edges_of(faces[sound]).valence % 2 == 0).all())
-
-
-def volume(mesh: Mesh) -> Tensor:
-    """Signed volume of a closed mesh, a scalar tensor: positive for outward faces.  Differentiable."""
-    a, b, c = (mesh.vertices.index_select(0, mesh.faces[:, k]) for k in range(3))
-    return (a * torch.linalg.cross(b, c)).sum() / 6.0

@@ -33,11 +33,6 @@ class OccupancyGrid:
             raise ValueError(f"radius: expected a positive number, got {self.radius}")
 
     @classmethod
-    def full(cls, resolution: int, radius: float, device: torch.device | None = None) -> "OccupancyGrid":
-        """Grid with every cell occupied."""
-        return cls(torch.ones(resolution, resolution, resolution, dtype=torch.bool, device=device), radius)
-
-    @classmethod
     def of_density(
         cls,
         field: Callable[[Tensor], Tensor],

@@ -151,7 +151,6 @@ def meshes():
     return (
         report,
         mesh.largest_components(shape),
-        mesh.volume(shape),
         mesh.watertight(shape),
         reli3d.unwrap(shape, texture_size=64).with_tangents().tangents,
     )

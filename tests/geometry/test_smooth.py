@@ -6,9 +6,9 @@ import pytest
 import torch
 import trimesh
 
-from reli3d.geometry.mesh import Mesh, volume
+from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.smooth import taubin_smooth
-from tests.support.meshes import mesh_from, sheet
+from tests.support.meshes import mesh_from, sheet, volume
 
 
 def ball(device="cpu", subdivisions=3, noise=0.0):
@@ -45,7 +45,7 @@ def test_noise_is_removed_and_the_volume_kept(device):
 
     assert spread(smooth) < 0.4 * spread(noisy)
     # the pass band lifts a frequency by at most 0.975 * 1.0263 - 1 = 6.6e-4 a pair, which is 4 % of volume after 20
-    assert abs(float(volume(smooth) / volume(clean)) - 1) < 0.04
+    assert abs(volume(smooth) / volume(clean) - 1) < 0.04
 
 
 def test_borders_stay():

@@ -11,7 +11,6 @@ from reli3d.render.material import eval_bsdf, pdf_bsdf, pdf_lobes, sample_bsdf
 from reli3d.render.sampling import (
     antithetic,
     halton,
-    pdf_cosine,
     pdf_ggx_vndf,
     sample_cosine,
     sample_ggx_vndf,
@@ -67,6 +66,10 @@ def test_lobes_follow_their_densities(device, alpha, deg, phi, drawn, seed):
         grid = chi2.Window(wo, alpha, drawn == "mirrored")
         wrong["view"] = lambda d: pdf_lobes(view(89.1, device, phi), a, d)[:, k]
     return chi2.check(grid, torch.cat(valid), pdf, wrong, total)
+
+
+def pdf_cosine(wi):
+    return wi[..., 2].clamp(min=0.0) / math.pi
 
 
 def test_cosine_follows_its_density(device):
