@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reli3d.cli.exit_codes import Parser, check_ranges, command, report
+from reli3d.cli.infer import choose_device
 from reli3d.errors import InputError
 
 if TYPE_CHECKING:
@@ -146,17 +147,8 @@ def small_stage(args: argparse.Namespace) -> "Stage":
     model = reduced_model(model, finest).train() if finest else model
     options = SmallOptions(**given(args, "max_views", "points", "pyramid_rate", "bfloat16"))
     make = PixelStage if pixels else SmallStage
-    return make(model.to(device_of(args)), args.data, options, **given(args, "seed", "maps", "validation"))
-
-
-def device_of(args: argparse.Namespace) -> str:
-    """The device of ``--device``, the CPU by default.  Raises InputError where there is none."""
-    import torch
-
-    device = getattr(args, "device", "cpu")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device", "expected a CUDA device, got none; leave it out to train on the CPU")
-    return device
+    device = choose_device(getattr(args, "device", "cpu"))
+    return make(model.to(device), args.data, options, **given(args, "seed", "maps", "validation"))
 
 
 def small_network(start: str | None, resumed: Path) -> "LocalReconstructor":
@@ -212,7 +204,7 @@ def paper_stage(args: argparse.Namespace) -> "Stage":
         raise InputError("--stage", f"expected {known} for preset {preset.name}, got {args.stage}")
     if not args.data and "export" not in args:
         raise InputError("data", "expected folders of samples, captures or shards, got none")
-    device = device_of(args)
+    device = choose_device(getattr(args, "device", "cpu"))
     numbers = given(args, *OF_CONFIG)
     if "samples" in numbers:
         numbers["samples"] = tuple(numbers["samples"])

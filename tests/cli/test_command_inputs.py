@@ -5,7 +5,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from reli3d.cli import data, render, train
+from reli3d.cli import data, infer, render, train
 from reli3d.cli import eval as evaluation
 from reli3d.errors import InputError
 from reli3d.synthetic.stored import OPTIONAL, TENSORS, check_sample
@@ -188,8 +188,10 @@ def test_a_device_is_cpu_or_cuda(device, capsys):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_cuda_that_is_missing_is_reported(capsys):
-    assert render.main(["x.glb", "--device", "cuda"]) == 2
+@pytest.mark.parametrize("command, path", [(render, "x.glb"), (infer, infer.EXAMPLE)])
+def test_cuda_that_is_missing_is_reported(command, path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert command.main([str(path), "--device", "cuda"]) == 2
     assert "expected a CUDA device" in capsys.readouterr().err
 
 

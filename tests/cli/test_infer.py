@@ -124,12 +124,6 @@ def test_options_out_of_range_end_with_2(tmp_path, capsys, arguments):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_cuda_is_not_replaced_by_the_cpu(tmp_path, capsys):
-    assert infer.main(["--device", "cuda", "--output", str(tmp_path / "out")]) == 2
-    assert "expected a CUDA device" in capsys.readouterr().err
-
-
 def test_check_explains_the_example_and_draws_the_rig(tmp_path, capsys):
     assert check.main(["--output", str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
