@@ -541,7 +541,7 @@ def reconstruct_folder(
         on_device = shown.to(model.device)
         sheet = preview(asset, on_device, scene)  # the longest tasks first, to balance the threads
         measured = results.measure(asset.mesh, scene, on_device)
-        encoded = results.encode(asset, shown, frames, name=name, before=first, translation=moved, scene=scene)
+        glb, page = results.encode(asset, shown, frames, name=name, before=first, translation=moved, scene=scene)
         drawn, measures = sheet(), measured()
     info = {
         "object": name,
@@ -563,7 +563,7 @@ def reconstruct_folder(
         "versions": results.versions(),
     }
     progress("writing")
-    results.write_results(replacing, encoded, drawn, info, comparison=compared)
+    results.write_results(replacing, asset, glb, page, drawn, info, comparison=compared)
 
 
 @contextmanager
