@@ -4,6 +4,7 @@ Faces are counter-clockwise seen from outside.  Topology (components, report) re
 vertices at bit-identical positions are merged, because atlases and exporters split the vertices of a connected surface.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -161,6 +162,13 @@ def select_faces(mesh: Mesh, keep: Tensor) -> Mesh:
     new_index = torch.cumsum(used, 0, dtype=torch.int32) - 1
     rest = (None if v is None else v[used] for v in (mesh.normals, mesh.uv, mesh.tangents, mesh.colors))
     return Mesh(mesh.vertices[used], new_index[faces.long()].reshape(-1, 3), *rest)
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """The concatenation of at least one mesh, with positions and faces only; face indices continue."""
+    starts = np.cumsum([0] + [len(m.vertices) for m in meshes])
+    faces = [m.faces + int(s) for m, s in zip(meshes, starts)]
+    return Mesh(torch.cat([m.vertices for m in meshes]), torch.cat(faces))
 
 
 def largest_components(mesh: Mesh, min_fraction: float = 0.02) -> Mesh:
