@@ -115,10 +115,11 @@ def _with_predicted_normals(field: LocalField, mesh: Mesh) -> Mesh:
 
 def _free_surface(field: TriplaneField, resolution: int) -> Mesh:
     radius = field.model.preset.radius
-    flat = _grid(resolution, radius, field.maps.images.device).reshape(-1, 3)
-    sdf = field.grid_sdf(flat[: resolution + 1, 2])
+    axis = torch.linspace(-radius, radius, resolution + 1, device=field.maps.images.device, dtype=torch.float32)
+    sdf = field.grid_sdf(axis)
     _check_signs(sdf)
-    return extract_surface(sdf, radius=radius, weights=field.cube_weights(flat, sdf))
+    points = torch.cartesian_prod(axis, axis, axis)
+    return extract_surface(sdf, radius=radius, weights=field.cube_weights(points, sdf))
 
 
 def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
@@ -162,11 +163,6 @@ def _grid_points(axis: Tensor, index: Tensor) -> Tensor:
     """Points ``(N, 3)`` of the grid along ``axis (n,)`` with the flat indices ``index (N,)``."""
     n = len(axis)
     return torch.stack([axis[index // (n * n)], axis[index // n % n], axis[index % n]], 1)
-
-
-def _grid(resolution: int, radius: float, device: torch.device) -> Tensor:
-    axis = torch.linspace(-radius, radius, resolution + 1, device=device, dtype=torch.float32)
-    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
 
 
 def texture(

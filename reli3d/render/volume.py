@@ -50,7 +50,7 @@ class OccupancyGrid:
         k = (torch.arange(2 * resolution + 1, device=device, dtype=torch.float32) / resolution - 1.0) * radius
         values = []
         with torch.no_grad():
-            points = torch.stack(torch.meshgrid(k, k, k, indexing="ij"), -1).reshape(-1, 3)
+            points = torch.cartesian_prod(k, k, k)
             for part in points.split(CHUNK):
                 values.append(field(part) > threshold)
         fine = torch.cat(values).reshape(1, 1, *(2 * resolution + 1,) * 3).float()

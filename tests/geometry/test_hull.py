@@ -275,7 +275,8 @@ def test_the_reach_is_that_of_the_points_inside(device, radius, views):
     images = torch.cat([torch.zeros(*masks.shape, 3, device=device), mask_distance(masks)[..., None]], -1)
     maps = ViewMaps(images.new_empty(views, 1, 1, 1), images, camera)
     model = SimpleNamespace(preset=SMALL)
-    grid = pipeline._grid(80, SMALL.radius, device).reshape(-1, 3)
+    axis = torch.linspace(-SMALL.radius, SMALL.radius, 81, device=device)
+    grid = torch.cartesian_prod(axis, axis, axis)
     dense = float(grid[hull_distance(grid, maps.silhouette, maps.camera) > 0].abs().max())
     assert pipeline._hull_reach(LocalField(maps, model, None, None, None, None, None), 80) == dense
     empty = replace(maps, images=images - 1000.0)

@@ -43,7 +43,8 @@ def test_weights_evaluated_near_the_surface_give_the_published_mesh(goldens):
     assert not unknown and not [k for k in missing if k.startswith(("heads.", "merger."))]
     none = torch.zeros(1)
     code = Code(torch.from_numpy(data["triplane"]), none, none, none, none)
-    flat = pipeline._grid(16, 0.87, torch.device("cpu")).reshape(-1, 3)
+    axis = torch.linspace(-0.87, 0.87, 17)
+    flat = torch.cartesian_prod(axis, axis, axis)
     sdf = model.sdf(model.query(code, flat[None], ("density",))["density"])[0, :, 0].view(17, 17, 17)
     weights = field.TriplaneField(None, model, code).cube_weights(flat, sdf)
     got = extract_surface(sdf, radius=0.87, closed=False, weights=weights)
@@ -57,7 +58,8 @@ def test_weights_evaluated_near_the_surface_give_the_published_mesh(goldens):
 def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
     """Also where the cap touches the box, away from every cube that the surface crosses inside."""
     code, n = tiny.encode(*views(1, 2, 76)), 12
-    flat = pipeline._grid(n, 0.87, torch.device("cpu")).reshape(-1, 3)
+    axis = torch.linspace(-0.87, 0.87, n + 1)
+    flat = torch.cartesian_prod(axis, axis, axis)
     raw = tiny.query(code, flat[None], ("density", "deformation", "flexicubes"))
     sdf = tiny.sdf(raw["density"])[0, :, 0].view(13, 13, 13)
     if half_space:
