@@ -121,7 +121,6 @@ def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def small_stage(args: argparse.Namespace) -> "Stage":
-    """A stage of the small network."""
     from reli3d.nn.presets import CALIBRATED_VIEWS
     from reli3d.synthetic.stored import check_samples
     from reli3d.train.pixels import reduced_model
@@ -177,7 +176,6 @@ def small_network(start: str | None, resumed: Path) -> "LocalReconstructor":
 
 
 def light_prior_stage(args: argparse.Namespace) -> "Stage":
-    """Training of the environment decoder alone."""
     from reli3d.nn.presets import OFFICIAL, TINY
     from reli3d.train.light_prior import LightPriorStage
 
@@ -188,8 +186,6 @@ def light_prior_stage(args: argparse.Namespace) -> "Stage":
 
 
 def paper_stage(args: argparse.Namespace) -> "Stage":
-    """A stage of the paper's network."""
-
     from reli3d.nn.model import Reconstructor
     from reli3d.nn.presets import OFFICIAL, TINY
     from reli3d.train.stages import config

@@ -165,11 +165,9 @@ def frame_record(
 
 
 def weights_record(manifest: Manifest, digest: str) -> dict:
-    """Name, hash and license of the weights."""
     return {"file": Path(manifest.path).name, "sha256": digest, "license": manifest.license}
 
 
 def versions() -> dict[str, str]:
-    """Versions of this package and of its numerical dependencies."""
     others = {name: version(name) for name in ("torch", "warp-lang", "embreex", "numpy")}
     return {"reli3d": reli3d.__version__, **others}  # also from a checkout that is not installed

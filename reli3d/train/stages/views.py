@@ -40,7 +40,6 @@ class ObjectViews(Movable):
         return len(self.images)
 
     def select(self, views: Sequence[int]) -> "ObjectViews":
-        """The views of these indices, in this order."""
         chosen = torch.as_tensor(list(views))
         of_views = mapped(replace(self, latent=None, strength=None), lambda values: values[chosen])
         return replace(of_views, latent=self.latent, strength=self.strength)
