@@ -156,10 +156,3 @@ def test_a_bug_outside_of_the_objects_is_logged_next_to_the_output(tmp_path, mon
     out, err = capsys.readouterr()
     assert out == "" and err.startswith("reli3d-infer: TypeError: ") and err.count("\n") == 1
     assert "Traceback" in (tmp_path / "out.reli3d.log").read_text()
-
-
-def test_wrong_arguments_are_one_line_too(tmp_path, capsys):
-    for arguments in (["--no-such-option"], ["--device", "abacus"], ["--views", "many"]):
-        assert infer.main(arguments) == 2
-        out, err = capsys.readouterr()
-        assert out == "" and err.startswith("reli3d-infer: arguments: ") and err.count("\n") == 1

@@ -228,8 +228,6 @@ def test_halton_points_are_the_radical_inverses():
 
 def test_bad_input_is_named(device):
     wo, alpha, u = torch.rand(4, 3, device=device), torch.rand(4, device=device), torch.rand(4, 2, device=device)
-    with pytest.raises(TypeError, match="wo: expected torch.float32"):
-        sample_ggx_vndf(wo.double(), alpha, u)
     with pytest.raises(ValueError, match="u: expected shape"):
         sample_ggx_vndf(wo, alpha, wo)
     with pytest.raises(ValueError, match="lobe: expected"):

@@ -225,5 +225,3 @@ def test_bad_input_is_named(device):
     samples, density, color = packed([3], device)
     with pytest.raises(ValueError, match="density: expected"):
         composite(density[:2], color, samples)
-    with pytest.raises(TypeError, match="color: expected"):
-        composite(density, color.double(), samples)
