@@ -70,18 +70,6 @@ def _bins(lower: Tensor, upper: Tensor, size: int, tile: int) -> tuple[Tensor, T
     return start.to(torch.int32), (order % max(len(lower), 1)).to(torch.int32)
 
 
-def _tiles(corners: Tensor, lower: Tensor, upper: Tensor, size: int, tile: int) -> kernels.Tiles:
-    """Kernel struct of faces ``corners (F, 3, 2)``, whose boxes are ``lower`` to ``upper``."""
-    start, faces = _bins(lower, upper, size, tile)
-    return struct_of(kernels.Tiles, corners=corners, face_start=start, face_list=faces, size=size, tile=tile)
-
-
-def _border_segments(faces: Tensor) -> Tensor:
-    """``3 * face + corner``, ascending, of the edges that only one face has."""
-    single = np.sort(edges_of(faces.cpu().numpy()).of_valence(1)[0]).astype(np.int32)
-    return torch.from_numpy(single).to(faces.device)
-
-
 def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     """Face and barycentrics of every texel of a ``size`` x ``size`` map over the UV of ``mesh``.
 
@@ -99,8 +87,10 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
         return Texels(face.fill_(-1), bary.zero_(), torch.zeros_like(face, dtype=torch.bool))
     tile = TILE_TEXELS[device.type]
     lower, upper = torch.aminmax(corners, dim=1)
-    tiles = _tiles(corners, lower, upper, size, tile)
-    segments = _border_segments(mesh.faces)
+    start, listed = _bins(lower, upper, size, tile)
+    tiles = struct_of(kernels.Tiles, corners=corners, face_start=start, face_list=listed, size=size, tile=tile)
+    single = np.sort(edges_of(mesh.faces.cpu().numpy()).of_valence(1)[0]).astype(np.int32)  # edges with one face
+    segments = torch.from_numpy(single).to(device)  # 3 * face + corner
     ends = torch.stack([corners.reshape(-1, 2), corners.roll(-1, 1).reshape(-1, 2)], 1)[segments.long()]
     lower, upper = torch.aminmax(ends, dim=1)
     segment_start, segment_list = _bins(lower - BORDER_TEXELS, upper + BORDER_TEXELS, size, tile)

@@ -14,13 +14,14 @@ from bench.surface import field
 from reli3d.geometry.bake import bake, nearest_valid, rasterize_texels
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.surface import extract_surface
-from reli3d.geometry.tangents import decode_normals, encode_normals
+from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import write_glb
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import srgb_to_linear
 from tests.support import gltf
 from tests.support.meshes import QUICK, SLOW, loaded, mesh_from
+from tests.support.reference import decode_normals
 from tests.support.texels import bilinear, color
 
 SIZE = 256

@@ -14,10 +14,11 @@ from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.regularize import vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import CubeWeights, extract_surface
-from reli3d.geometry.tangents import decode_normals, encode_normals
+from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.kernels.flexicubes import SDF_MIN
 from tests.support import reference_surface
+from tests.support.reference import decode_normals
 
 N = 100_000
 CUBES = 47  # a side: 103,823 cubes

@@ -17,7 +17,7 @@ from torch.nn.functional import grid_sample, normalize
 from reli3d.geometry.bake import bake, rasterize_texels
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.surface import extract_surface
-from reli3d.geometry.tangents import decode_normals, encode_normals
+from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import read_glb, write_glb
@@ -25,6 +25,7 @@ from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions, quarter_turn
 from tests.support.meshes import mesh_from, volume
+from tests.support.reference import decode_normals
 
 SIZE = 128
 
