@@ -4,7 +4,7 @@ import torch
 import trimesh
 from scipy import ndimage
 
-from reli3d.geometry.bake import bake, dilate, rasterize_texels
+from reli3d.geometry.bake import bake, nearest_valid, rasterize_texels
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import unwrap
@@ -38,7 +38,15 @@ def filling(device, subdivisions, size):
     """Nine channels filled from the nearest valid texel."""
     valid = rasterize_texels(sphere(device, subdivisions, size), size).valid
     maps = torch.rand(size, size, 9, device=device)
-    return lambda: dilate(maps, valid), {"texels": size * size}
+
+    def step():
+        source, square = nearest_valid(valid)
+        rows = (square > 0.0).view(-1).nonzero()[:, 0]
+        filled = maps.clone()
+        filled.view(-1, 9).index_copy_(0, rows, maps.view(-1, 9).index_select(0, source.view(-1)[rows]))
+        return filled
+
+    return step, {"texels": size * size}
 
 
 def scipy_filling(device, subdivisions, size):

@@ -19,7 +19,7 @@ def example() -> Path:
 
 def views_to_glb(device, texture_size, resolution):
     """Views and ``small`` weights in memory to ``mesh.glb`` on disk; the parts of the time are the pipeline's own."""
-    views = load_views(example(), first_views=4)
+    views = load_views(example()).select(4)
     model = load_model("small", str(device))
     options = ReconstructOptions(texture_size=texture_size, resolution=resolution)
     folder = tempfile.TemporaryDirectory()

@@ -1,9 +1,8 @@
-"""Lookup of a lat-long map against torch's grid_sample; sampling its table; spherical Gaussians against plain torch."""
+"""Lookup of a lat-long map against torch's grid_sample; sampling its table."""
 
 import torch
 
 from reli3d.render.environment import Environment
-from reli3d.render.gaussians import SphericalGaussians
 
 
 def inputs(device, n, height):
@@ -52,41 +51,10 @@ def sample(device, n, height):
     return lambda: environment.sample(u), {"samples": n}
 
 
-def lobes(device, count):
-    rng = torch.Generator(device).manual_seed(2)
-    axis = torch.nn.functional.normalize(torch.randn(count, 3, generator=rng, device=device), dim=-1)
-    return [axis, torch.rand(count, generator=rng, device=device) * 50 + 1, axis.abs().clone()]
-
-
-def gaussians(device, n, count):
-    """Value and gradient of ``count`` lobes at ``n`` directions."""
-    values = [v.requires_grad_() for v in lobes(device, count)]
-    _, directions, weight = inputs(device, n, 4)
-    light = SphericalGaussians(*values)
-    return lambda: torch.autograd.grad(light.lookup(directions), values, weight), {"lobes": n * count}
-
-
-def torch_gaussians(device, n, count):
-    """The same from a matrix product and an exponential."""
-    axis, sharpness, amplitude = values = [v.requires_grad_() for v in lobes(device, count)]
-    _, directions, weight = inputs(device, n, 4)
-
-    def step():
-        value = torch.exp(sharpness * (directions @ axis.T - 1.0)) @ amplitude
-        return torch.autograd.grad(value, values, weight)
-
-    return step, {"lobes": n * count}
-
-
 _SIZE = dict(n=1 << 20, height=256)
 CASES = {
     "lookup": (lookup, dict(backward=False, **_SIZE)),
     "lookup_grad": (lookup, dict(backward=True, **_SIZE)),
     "sample": (sample, _SIZE),
-    "gaussians": (gaussians, dict(n=8192, count=128)),
 }
-PEERS = {
-    "lookup": ("torch", torch_lookup),
-    "lookup_grad": ("torch", torch_lookup),
-    "gaussians": ("torch", torch_gaussians),
-}
+PEERS = {"lookup": ("torch", torch_lookup), "lookup_grad": ("torch", torch_lookup)}

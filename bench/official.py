@@ -20,13 +20,10 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from bench.timing import _status, synchronize
-from reli3d.geometry.camera import Camera
 from reli3d.nn import weights
-from reli3d.nn.field import TriplaneField
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import OFFICIAL, EncoderSizes, Preset
 from reli3d.nn.reni import EnvironmentDecoder
-from reli3d.nn.view_features import ViewMaps
 
 PARTS = ("camera", "encoder", "bank", "backbone", "upsampler", "illumination", "environment", "heads", "merger")
 # Parameters as the specification counts them, by part of ours.  It gives no number for the illumination: that is its
@@ -219,11 +216,8 @@ def forward(path: Path, count: int, trunk: torch.dtype, device: torch.device, ru
         for name, seconds in clock.seconds.items():
             rate = f"{flops[name] / seconds / 1e9:8.0f} GFLOP/s" if flops.get(name) else ""
             print(f"  {name:16s} {seconds:8.3f} s {rate}")
-        images, masks, c2w, intrinsics = (t[0] for t in inputs)
-        camera = Camera(c2w, intrinsics, *masks.shape[:0:-1])
-        maps = ViewMaps(code.view_tokens[0].float(), torch.cat([images, masks[..., None]], -1), camera)
         began, side = time.perf_counter(), torch.linspace(-0.87, 0.87, model.preset.resolution + 1, device=device)
-        TriplaneField(maps, model, code).free_sdf(torch.cartesian_prod(side, side, side))
+        model.sdf(model.query(code, torch.cartesian_prod(side, side, side)[None], ("density",))["density"])
         synchronize(device)
         print(f"  {'SDF on grid':16s} {time.perf_counter() - began:8.3f} s")
         if device.type == "cuda":

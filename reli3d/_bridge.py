@@ -14,9 +14,10 @@ import os
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields, is_dataclass, replace
 from functools import cache, lru_cache
 from types import ModuleType
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -82,7 +83,7 @@ def over_slices(n: int, work, *, slice_min: int = SLICE_MIN) -> list:
     parts = slices(n, slice_min)
     if len(parts) == 1:
         return [work(0, *parts[0])]
-    return _mapped(lambda item: work(item[0], *item[1]), enumerate(parts))
+    return _in_pool(lambda item: work(item[0], *item[1]), enumerate(parts))
 
 
 def over_rows(n: int, rows: int, work) -> list:
@@ -96,10 +97,10 @@ def over_rows(n: int, rows: int, work) -> list:
         with torch.no_grad():  # grad mode is thread-local
             return work(start, min(start + rows, n))
 
-    return _mapped(block, range(0, n, rows))
+    return _in_pool(block, range(0, n, rows))
 
 
-def _mapped(work, items: Iterable) -> list:
+def _in_pool(work, items: Iterable) -> list:
     return [work(item) for item in items] if serial() else list(pool().map(work, items))
 
 
@@ -367,6 +368,34 @@ def tensor_of(value, dtype: torch.dtype = torch.float32):
         low, high = (int(v) for v in torch.aminmax(value)) if value.numel() else (0, 0)
         return value.to(dtype) if limits.min <= low and high <= limits.max else value
     return value
+
+
+def mapped(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """``value`` with ``change`` applied to its tensors, inside tuples and dataclasses too.
+
+    A dataclass in which nothing changes is returned itself, with what it caches.
+    """
+    if isinstance(value, Tensor):
+        return change(value)
+    if isinstance(value, tuple):
+        return tuple(mapped(v, change) for v in value)
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    old = {f.name: getattr(value, f.name) for f in fields(value)}
+    new = {name: mapped(v, change) for name, v in old.items()}
+    return value if all(new[name] is v for name, v in old.items()) else replace(value, **new)
+
+
+class Movable:
+    """Base class of frozen dataclasses of tensors."""
+
+    def to(self: T, device: torch.device | str) -> T:
+        """The same values on ``device``; ``self`` if all are there already."""
+        return mapped(self, lambda tensor: tensor.to(device))
+
+    def detach(self: T) -> T:
+        """The same values without gradient."""
+        return mapped(self, lambda tensor: tensor.detach())
 
 
 def present(name: str, value: T | None) -> T:

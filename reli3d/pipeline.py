@@ -31,7 +31,7 @@ from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import source_vertices, unwrap, unwrap_xatlas
 from reli3d.nn.blocks import in_rows, submit
-from reli3d.nn.field import CHUNK, Field, TriplaneField
+from reli3d.nn.field import CHUNK, TriplaneField
 from reli3d.nn.local import HEAD_OUTPUTS, VIEW_WEIGHT, LocalField, LocalReconstructor
 from reli3d.nn.presets import CALIBRATED_VIEWS, LocalPreset, Preset
 from reli3d.nn.view_features import ViewMaps
@@ -60,6 +60,8 @@ OUTSIDE_FIELD = 1.0  # field value of grid points outside the visual hull
 NORMAL_LENGTH = 0.03  # model units: up to four views, predicted normals determine the shape of smaller features
 NORMAL_WEIGHT, MAX_NORMAL_WEIGHT = 8.0, 3.0  # of predicted normals; divided by the number of views
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
+
+Field = LocalField | TriplaneField  # network output for one object
 
 
 class NoSurface(InputError):
@@ -93,8 +95,6 @@ def extract(field: Field, resolution: int) -> Mesh:
         mesh = largest_components(_bounded_surface(field, resolution), MIN_PART_FRACTION)
         mesh = taubin_smooth(mesh, iterations=field.model.preset.smoothing)  # predictions are noisy between cells
         return _with_predicted_normals(field, replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)))
-    if not isinstance(field, TriplaneField):
-        raise TypeError(f"field: expected LocalField or TriplaneField, got {type(field).__name__}")
     mesh = largest_components(_free_surface(field, resolution), MIN_PART_FRACTION)
     return replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces))
 
@@ -115,10 +115,11 @@ def _with_predicted_normals(field: LocalField, mesh: Mesh) -> Mesh:
 
 def _free_surface(field: TriplaneField, resolution: int) -> Mesh:
     radius = field.model.preset.radius
-    flat = _grid(resolution, radius, field.maps.images.device).reshape(-1, 3)
-    sdf = field.grid_sdf(flat[: resolution + 1, 2])
+    axis = torch.linspace(-radius, radius, resolution + 1, device=field.maps.images.device, dtype=torch.float32)
+    sdf = field.grid_sdf(axis)
     _check_signs(sdf)
-    return extract_surface(sdf, radius=radius, weights=field.cube_weights(flat, sdf))
+    points = torch.cartesian_prod(axis, axis, axis)
+    return extract_surface(sdf, radius=radius, weights=field.cube_weights(points, sdf))
 
 
 def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
@@ -164,11 +165,6 @@ def _grid_points(axis: Tensor, index: Tensor) -> Tensor:
     return torch.stack([axis[index // (n * n)], axis[index // n % n], axis[index % n]], 1)
 
 
-def _grid(resolution: int, radius: float, device: torch.device) -> Tensor:
-    axis = torch.linspace(-radius, radius, resolution + 1, device=device, dtype=torch.float32)
-    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
-
-
 def texture(
     field: Field, mesh: Mesh, size: int, scene: RayScene | None, *, uv: str = "project"
 ) -> tuple[Mesh, TextureSet]:
@@ -202,8 +198,8 @@ def texture(
             heads, corners = values[0].split([HEAD_OUTPUTS, len(maps.images)], 1)
             visible = maps.visibility_within(present("scene", scene), position, normal, corners)
             got = local.material_from_heads(heads, position, normal, visible)
-        else:
-            got = field.material(position, normal, position.new_zeros(len(position), len(maps.images)))
+        elif isinstance(field, TriplaneField):
+            got = field.material(position, normal)
         found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
         return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 
@@ -393,7 +389,7 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
     with watch.stage("surface"):
         mesh = extract(field, options.resolution or model.preset.resolution)
     with watch.stage("textures"):
-        scene = RayScene(mesh.vertices, mesh.faces) if field.reads_views else None
+        scene = RayScene(mesh.vertices, mesh.faces) if isinstance(field, LocalField) else None
         mesh, textures = texture(field, mesh, options.texture_size, scene, uv=options.uv)
     with watch.stage("light"):
         asset = Asset(mesh, textures, light(field))
@@ -541,7 +537,7 @@ def reconstruct_folder(
         on_device = shown.to(model.device)
         sheet = preview(asset, on_device, scene)  # the longest tasks first, to balance the threads
         measured = results.measure(asset.mesh, scene, on_device)
-        encoded = results.encode(asset, shown, frames, name=name, before=first, translation=moved, scene=scene)
+        glb, page = results.encode(asset, shown, frames, name=name, before=first, translation=moved, scene=scene)
         drawn, measures = sheet(), measured()
     info = {
         "object": name,
@@ -563,7 +559,7 @@ def reconstruct_folder(
         "versions": results.versions(),
     }
     progress("writing")
-    results.write_results(replacing, encoded, drawn, info, comparison=compared)
+    results.write_results(replacing, asset, glb, page, drawn, info, comparison=compared)
 
 
 @contextmanager

@@ -42,20 +42,6 @@ def parser() -> Parser:
     return p
 
 
-class _Bar:
-    """A progress bar of one stage after the other, on stderr where that is a terminal."""
-
-    def __init__(self) -> None:
-        from tqdm import tqdm
-
-        self.bar = tqdm(file=sys.stderr, disable=None, bar_format="{desc}: {bar:20} {n_fmt}/{total_fmt} {elapsed}")
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        self.bar.set_description_str(stage, refresh=False)
-        self.bar.n, self.bar.total = done, total
-        self.bar.refresh()
-
-
 @command("reli3d capture")
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
@@ -64,12 +50,20 @@ def main(argv: list[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         raise InputError(str(error.name), "is not installed: pip install 'reli3d[capture]'") from None
 
-    bar = _Bar()
+    from tqdm import tqdm
+
+    bar = tqdm(file=sys.stderr, disable=None, bar_format="{desc}: {bar:20} {n_fmt}/{total_fmt} {elapsed}")
+
+    def progress(stage: str, done: int, total: int) -> None:
+        bar.set_description_str(stage, refresh=False)
+        bar.n, bar.total = done, total
+        bar.refresh()
+
     try:
         options = CaptureOptions(args.masks, args.mask_method, args.turntable, args.size)
-        report = capture(args.source, args.output, options, bar)
+        report = capture(args.source, args.output, options, progress)
     finally:
-        bar.bar.close()
+        bar.close()
     lines = [*report.notes, *(f"left out {name}: {why}" for name, why in report.left_out.items())]
     if report.lost:
         lines.append(f"not registered: {', '.join(report.lost)}")

@@ -88,7 +88,6 @@ def glb_files(paths: list[Path] | None) -> tuple[Path, ...]:
 
 
 def _sample_spec(args: argparse.Namespace) -> SampleSpec:
-    """The validated arguments."""
     from reli3d.output.folder import check_folder
     from reli3d.synthetic.maps import held_out, load_maps
     from reli3d.synthetic.protocol import LIGHTS

@@ -4,8 +4,7 @@ import hashlib
 import json
 import os
 import platform
-import shutil
-import subprocess
+import re
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -15,20 +14,6 @@ from pathlib import Path
 import reli3d
 from reli3d.cli.exit_codes import Parser, command
 
-REQUIRED = (
-    "torch",
-    "warp-lang",
-    "numpy",
-    "scipy",
-    "pillow",
-    "safetensors",
-    "trimesh",
-    "embreex",
-    "OpenEXR",
-    "manifold3d",
-    "xatlas",
-    "tqdm",
-)
 ASSETS = Path(reli3d.__file__).parent / "assets"
 PROBLEM = "PROBLEM: "  # prefix of a value that makes the package unusable
 
@@ -39,7 +24,7 @@ def examine() -> tuple[list[tuple[str, str]], bool]:
     Compiles one kernel unless it is cached, which takes some seconds.
     """
     rows = []
-    for part in (_versions, _devices, _cache, _kernels, _files, _tools):
+    for part in (_versions, _devices, _cache, _kernels, _files):
         try:
             rows += list(part())
         except Exception as error:  # reported as a row; the other parts still run
@@ -52,7 +37,8 @@ def examine() -> tuple[list[tuple[str, str]], bool]:
 def _versions() -> Iterator[tuple[str, str]]:
     yield "reli3d", f"{reli3d.__version__} in {Path(reli3d.__file__).parent}"
     yield "python", f"{platform.python_version()} on {platform.platform()}"
-    for package in REQUIRED:
+    required = [line for line in metadata.requires("reli3d") or [] if "extra ==" not in line]
+    for package in (re.split(r"[^\w-]", line)[0] for line in required):
         try:
             yield package, metadata.version(package)
         except metadata.PackageNotFoundError:
@@ -120,15 +106,6 @@ def _files() -> Iterator[tuple[str, str]]:
     example = ASSETS / "example"
     found = (example / "transforms.json").is_file()
     yield "example", str(example) if found else f"{PROBLEM}{example} is missing: install the package again"
-
-
-def _tools() -> Iterator[tuple[str, str]]:
-    node = shutil.which("node")
-    if node is None:
-        yield "node", "none (only the glTF validator of the tests uses it)"
-        return
-    done = subprocess.run([node, "--version"], capture_output=True, text=True, timeout=20)
-    yield "node", done.stdout.strip() or f"{node} does not run"
 
 
 @command("reli3d doctor")

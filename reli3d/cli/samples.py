@@ -29,8 +29,6 @@ class SampleSpec:
 
 
 class SampleJob:
-    """Renders samples in one process."""
-
     def __init__(self, spec: SampleSpec):
         import torch
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reli3d.cli.exit_codes import Parser, check_ranges, command, report
+from reli3d.cli.infer import choose_device
 from reli3d.errors import InputError
 
 if TYPE_CHECKING:
@@ -120,7 +121,6 @@ def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def small_stage(args: argparse.Namespace) -> "Stage":
-    """A stage of the small network."""
     from reli3d.nn.presets import CALIBRATED_VIEWS
     from reli3d.synthetic.stored import check_samples
     from reli3d.train.pixels import reduced_model
@@ -146,17 +146,8 @@ def small_stage(args: argparse.Namespace) -> "Stage":
     model = reduced_model(model, finest).train() if finest else model
     options = SmallOptions(**given(args, "max_views", "points", "pyramid_rate", "bfloat16"))
     make = PixelStage if pixels else SmallStage
-    return make(model.to(device_of(args)), args.data, options, **given(args, "seed", "maps", "validation"))
-
-
-def device_of(args: argparse.Namespace) -> str:
-    """The device of ``--device``, the CPU by default.  Raises InputError where there is none."""
-    import torch
-
-    device = getattr(args, "device", "cpu")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device", "expected a CUDA device, got none; leave it out to train on the CPU")
-    return device
+    device = choose_device(getattr(args, "device", "cpu"))
+    return make(model.to(device), args.data, options, **given(args, "seed", "maps", "validation"))
 
 
 def small_network(start: str | None, resumed: Path) -> "LocalReconstructor":
@@ -185,7 +176,6 @@ def small_network(start: str | None, resumed: Path) -> "LocalReconstructor":
 
 
 def light_prior_stage(args: argparse.Namespace) -> "Stage":
-    """Training of the environment decoder alone."""
     from reli3d.nn.presets import OFFICIAL, TINY
     from reli3d.train.light_prior import LightPriorStage
 
@@ -196,8 +186,6 @@ def light_prior_stage(args: argparse.Namespace) -> "Stage":
 
 
 def paper_stage(args: argparse.Namespace) -> "Stage":
-    """A stage of the paper's network."""
-
     from reli3d.nn.model import Reconstructor
     from reli3d.nn.presets import OFFICIAL, TINY
     from reli3d.train.stages import config
@@ -212,7 +200,7 @@ def paper_stage(args: argparse.Namespace) -> "Stage":
         raise InputError("--stage", f"expected {known} for preset {preset.name}, got {args.stage}")
     if not args.data and "export" not in args:
         raise InputError("data", "expected folders of samples, captures or shards, got none")
-    device = device_of(args)
+    device = choose_device(getattr(args, "device", "cpu"))
     numbers = given(args, *OF_CONFIG)
     if "samples" in numbers:
         numbers["samples"] = tuple(numbers["samples"])

@@ -19,7 +19,7 @@ from torch import Tensor
 from reli3d._bridge import present
 from reli3d.eval.metrics import geometry, psnr, ssim, surface_samples
 from reli3d.geometry.camera import Camera
-from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.mesh import joined
 from reli3d.io.glb import read_glb
 from reli3d.pipeline import Network, NoSurface, ReconstructOptions, reconstruct
 from reli3d.render.asset import Asset
@@ -149,13 +149,6 @@ def evaluate(
         found[f"{name}_ssim"] = float(np.mean([ssim(g[name], w[name]) for g, w in zip(result, reference, strict=True)]))
     names = ("image", "relit", "base_color")
     return found, [views.images[0], *(x[n] for n in names for x in (reference[0], result[0]))]
-
-
-def joined(meshes: Sequence[Mesh]) -> Mesh:
-    """The concatenation of meshes, with positions and faces only."""
-    starts = np.cumsum([0] + [len(m.vertices) for m in meshes])
-    faces = [m.faces + int(s) for m, s in zip(meshes, starts)]
-    return Mesh(torch.cat([m.vertices for m in meshes]), torch.cat(faces))
 
 
 def summary(rows: Sequence[dict[str, float]]) -> dict[str, float]:

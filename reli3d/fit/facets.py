@@ -25,9 +25,7 @@ def neighbor_faces(faces: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def flattened(
-    mesh: Mesh, *, normal_iterations: int = NORMAL_ITERATIONS, vertex_iterations: int = VERTEX_ITERATIONS
-) -> Mesh:
+def flattened(mesh: Mesh) -> Mesh:
     """``mesh`` denoised by bilateral filtering of its face normals; vertices and faces only.
 
     The normals are averaged over neighbors, weighted by area and by the distance between normals (Zheng, Fu, Au and Tai
@@ -40,7 +38,7 @@ def flattened(
     doubled = torch.linalg.cross(b - a, c - a)
     area = doubled.norm(dim=1, keepdim=True)
     normal = doubled / area.clamp(min=1e-20)
-    for _ in range(normal_iterations):
+    for _ in range(NORMAL_ITERATIONS):
         total = area * normal
         for side in across.unbind(1):
             other = normal.index_select(0, side)
@@ -49,7 +47,7 @@ def flattened(
         normal = unit(total)
     count = vertices.new_zeros(len(vertices), 1)
     count.index_add_(0, corners.reshape(-1), count.new_ones(corners.numel(), 1))
-    for _ in range(vertex_iterations):
+    for _ in range(VERTEX_ITERATIONS):
         ends = [vertices.index_select(0, k) for k in corners.unbind(1)]
         middle, step = sum(ends) / 3.0, torch.zeros_like(vertices)
         for k, end in zip(corners.unbind(1), ends, strict=True):

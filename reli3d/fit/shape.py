@@ -70,7 +70,7 @@ class Grid:
     def points(self, device) -> Tensor:
         """``(X, Y, Z, 3)``."""
         axes = [torch.linspace(-r, r, n, device=device, dtype=torch.float32) for r, n in zip(self.radius, self.shape)]
-        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+        return torch.cartesian_prod(*axes).view(*self.shape, 3)
 
 
 @torch.no_grad()
@@ -79,8 +79,7 @@ def start_sdf(mesh: Mesh, grid: Grid) -> Tensor:
     at = grid.points(mesh.vertices.device)
     few = tuple(max(2, (n - 1) // COARSE_RATIO + 1) for n in grid.shape)
     axes = [torch.linspace(-r, r, n, device=at.device, dtype=torch.float32) for r, n in zip(grid.radius, few)]
-    coarse = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
-    coarse = signed_distance(mesh.vertices, mesh.faces, coarse.reshape(-1, 3)).reshape(few)
+    coarse = signed_distance(mesh.vertices, mesh.faces, torch.cartesian_prod(*axes)).reshape(few)
     sdf = interpolate(coarse[None, None], grid.shape, mode="trilinear", align_corners=True)[0, 0].contiguous()
     spacing = max(2.0 * r / (n - 1) for r, n in zip(grid.radius, few))
     near = (

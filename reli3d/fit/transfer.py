@@ -10,8 +10,8 @@ from torch import Tensor
 
 from reli3d._bridge import present
 from reli3d.fit.unknowns import Unknowns, bent, material_change, material_logits, material_of, unit
-from reli3d.geometry.bake import Texels, dilate, interpolate, interpolate_tangents, rasterize_texels
-from reli3d.geometry.hits import interpolate as at_hits
+from reli3d.geometry.bake import bake, rasterize_texels
+from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.tangents import encode_normals
@@ -47,14 +47,17 @@ def transfer_textures(mesh: Mesh, source: Asset, size: int) -> Asset:
     """``mesh`` with a new atlas of ``size`` texels per side, and the lighting and maps of ``source``."""
     mesh = unwrap(mesh, texture_size=size)
     mesh = replace(mesh.with_tangents(), colors=None)  # vertex colors are baked into the maps below
-    texels = rasterize_texels(mesh, size)
-    index = torch.nonzero(texels.valid.reshape(-1))[:, 0]
-    position, normal = interpolate(mesh, texels, index)
-    face, bary = nearest_hits(source.mesh, position, normal)
-    old = surface_points(source.mesh, source.textures, face, bary)
-    bump = old.normal - unit(at_hits(present("mesh.normals", source.mesh.normals), source.mesh.faces, face, bary))
-    world = unit(normal + bump)
-    return Asset(mesh, _textures(mesh, texels, index, old, world, normal), source.environment)
+
+    def at_texels(position: Tensor, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:
+        face, bary = nearest_hits(source.mesh, position, normal)
+        old = surface_points(source.mesh, source.textures, face, bary)
+        bump = old.normal - unit(
+            interpolate(present("mesh.normals", source.mesh.normals), source.mesh.faces, face, bary)
+        )
+        return _maps(replace(old, normal=unit(normal + bump)), normal, tangent)
+
+    baked = bake(mesh, size, at_texels, tangents=True, chunk=size * size)
+    return Asset(mesh, _textures(baked), source.environment)
 
 
 def changed(asset: Asset, unknowns: Unknowns) -> Asset:
@@ -62,32 +65,28 @@ def changed(asset: Asset, unknowns: Unknowns) -> Asset:
     size = asset.textures.size
     texels = rasterize_texels(asset.mesh, size)
     index = torch.nonzero(texels.valid.reshape(-1))[:, 0]
-    position, normal = interpolate(asset.mesh, texels, index)
     found = texels.face.reshape(-1)[index], texels.bary.reshape(-1, 2)[index]
-    old = surface_points(asset.mesh, asset.textures, *found)
     row, column = torch.div(index, size, rounding_mode="floor"), index % size
     uv = (torch.stack([column, row], -1).float() + 0.5) / size
-    logits = material_logits(old) + material_change(unknowns, position)
-    logits[:, :3] += sample_texture(unknowns.detail, uv)
-    color, roughness, metallic = material_of(logits)
-    world, _ = bent(unknowns, position, old.normal)
-    new = SurfacePoints(position, old.ng, world, color, roughness, metallic)
-    return replace(asset, textures=_textures(asset.mesh, texels, index, new, world, normal))
+
+    def at_texels(position: Tensor, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:
+        old = surface_points(asset.mesh, asset.textures, *found)
+        logits = material_logits(old) + material_change(unknowns, position)
+        logits[:, :3] += sample_texture(unknowns.detail, uv)
+        color, roughness, metallic = material_of(logits)
+        world, _ = bent(unknowns, position, old.normal)
+        return _maps(SurfacePoints(position, old.ng, world, color, roughness, metallic), normal, tangent)
+
+    # one chunk: ``found`` and ``uv`` are those of all texels
+    baked = bake(asset.mesh, size, at_texels, texels=texels, tangents=True, chunk=size * size)
+    return replace(asset, textures=_textures(baked))
 
 
-def _textures(
-    mesh: Mesh, texels: Texels, index: Tensor, at: SurfacePoints, world: Tensor, normal: Tensor
-) -> TextureSet:
-    size = texels.face.shape[0]
-    encoded = encode_normals(world, normal, interpolate_tangents(mesh, texels, index))
-    maps = {}
-    for name, value in (
-        ("base_color", at.base_color),
-        ("roughness", at.roughness[:, None]),
-        ("metallic", at.metallic[:, None]),
-        ("normal", encoded),
-    ):
-        full = value.new_zeros(size * size, value.shape[1])
-        full[index] = value.clamp(0.0, 1.0)
-        maps[name] = full.reshape(size, size, -1)
-    return TextureSet(**dilate(maps, texels.valid))
+def _maps(at: SurfacePoints, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:
+    encoded = encode_normals(at.normal, normal, tangent)
+    rough, metal = at.roughness[:, None], at.metallic[:, None]
+    return {"base_color": at.base_color, "roughness": rough, "metallic": metal, "normal": encoded}
+
+
+def _textures(baked: dict[str, Tensor]) -> TextureSet:
+    return TextureSet(**{name: value.clamp(0.0, 1.0) for name, value in baked.items()})

@@ -64,7 +64,6 @@ class Unknowns:
         )
 
     def groups(self) -> dict[str, list[Tensor]]:
-        """The tensors by name."""
         return {name: value if isinstance(value, list) else [value] for name, value in vars(self).items()}
 
     @torch.no_grad()

@@ -6,7 +6,6 @@ T, (row + 0.5) / T).  No gradients.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import overload
 
 import numpy as np
 import torch
@@ -71,18 +70,6 @@ def _bins(lower: Tensor, upper: Tensor, size: int, tile: int) -> tuple[Tensor, T
     return start.to(torch.int32), (order % max(len(lower), 1)).to(torch.int32)
 
 
-def _tiles(corners: Tensor, lower: Tensor, upper: Tensor, size: int, tile: int) -> kernels.Tiles:
-    """Kernel struct of faces ``corners (F, 3, 2)``, whose boxes are ``lower`` to ``upper``."""
-    start, faces = _bins(lower, upper, size, tile)
-    return struct_of(kernels.Tiles, corners=corners, face_start=start, face_list=faces, size=size, tile=tile)
-
-
-def _border_segments(faces: Tensor) -> Tensor:
-    """``3 * face + corner``, ascending, of the edges that only one face has."""
-    single = np.sort(edges_of(faces.cpu().numpy()).of_valence(1)[0]).astype(np.int32)
-    return torch.from_numpy(single).to(faces.device)
-
-
 def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     """Face and barycentrics of every texel of a ``size`` x ``size`` map over the UV of ``mesh``.
 
@@ -100,8 +87,10 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
         return Texels(face.fill_(-1), bary.zero_(), torch.zeros_like(face, dtype=torch.bool))
     tile = TILE_TEXELS[device.type]
     lower, upper = torch.aminmax(corners, dim=1)
-    tiles = _tiles(corners, lower, upper, size, tile)
-    segments = _border_segments(mesh.faces)
+    start, listed = _bins(lower, upper, size, tile)
+    tiles = struct_of(kernels.Tiles, corners=corners, face_start=start, face_list=listed, size=size, tile=tile)
+    single = np.sort(edges_of(mesh.faces.cpu().numpy()).of_valence(1)[0]).astype(np.int32)  # edges with one face
+    segments = torch.from_numpy(single).to(device)  # 3 * face + corner
     ends = torch.stack([corners.reshape(-1, 2), corners.roll(-1, 1).reshape(-1, 2)], 1)[segments.long()]
     lower, upper = torch.aminmax(ends, dim=1)
     segment_start, segment_list = _bins(lower - BORDER_TEXELS, upper + BORDER_TEXELS, size, tile)
@@ -113,26 +102,6 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
         slice_min=TILES_MIN,
     )
     return Texels(face, bary, distance == 0.0)
-
-
-def interpolate(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions and unit normals ``(N, 3)`` at the valid texels with flat int64 indices ``index (N,)``.
-
-    Where the normals of a face cancel, the normal of its vertex 0.
-    """
-    return _positions_normals(mesh, *_checked_corners(mesh, texels, index))
-
-
-def interpolate_tangents(mesh: Mesh, texels: Texels, index: Tensor) -> Tensor:
-    """Unit tangents with the sign of vertex 0, ``(N, 4)``; arguments as in :func:`interpolate`."""
-    return _tangents(mesh, *_checked_corners(mesh, texels, index))
-
-
-def _checked_corners(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
-    check("index", index, dtype=torch.int64, like=texels.bary)
-    if index.ndim != 1 or (len(index) and not bool((texels.face.reshape(-1)[index] >= 0).all())):
-        raise ValueError("index: expected a list of valid texels, got others")
-    return _corner_weights(mesh, texels, index)
 
 
 def _corner_weights(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
@@ -224,12 +193,13 @@ def bake(
                 if value.shape[1] != maps[name].shape[1]:
                     raise ValueError(f"fn()[{name!r}]: expected {maps[name].shape[1]} channels, got {value.shape[1]}")
                 maps[name][part] = value
-    result = {name: value.view(size, size, -1) for name, value in maps.items()}
     if fill:
-        nearest = nearest_valid(texels.valid)
-        for value in result.values():
-            _fill(value, *nearest)
-    return result
+        source, square = nearest_valid(texels.valid)
+        rows = (square > 0.0).reshape(-1).nonzero().squeeze(1)
+        nearest = source.reshape(-1)[rows]
+        for value in maps.values():
+            value.index_copy_(0, rows, value.index_select(0, nearest))
+    return {name: value.view(size, size, -1) for name, value in maps.items()}
 
 
 def nearest_valid(valid: Tensor) -> tuple[Tensor, Tensor]:
@@ -249,41 +219,3 @@ def nearest_valid(valid: Tensor) -> tuple[Tensor, Tensor]:
     )
     _bridge.launch(kernels.nearest_texel_kernel, h, [row, site, border, source, square], device, slice_min=ROWS_MIN)
     return source, square
-
-
-@overload
-def dilate(maps: Tensor, valid: Tensor, *, iterations: int | None = None) -> Tensor: ...
-@overload
-def dilate(maps: Mapping[str, Tensor], valid: Tensor, *, iterations: int | None = None) -> dict[str, Tensor]: ...
-def dilate(
-    maps: Mapping[str, Tensor] | Tensor, valid: Tensor, *, iterations: int | None = None
-) -> dict[str, Tensor] | Tensor:
-    """Fills every texel of ``maps`` that is not ``valid`` with the value of the nearest valid texel.
-
-    maps: ``(H, W, C)`` float32, or a dictionary of such maps; not modified.  valid: ``(H, W)`` bool.  iterations: fill
-    only up to this distance [texels]; None fills all texels, so that no mip level contains an unwritten texel.  Ties go
-    to the upper row, then the left column.
-    """
-    if iterations is not None and iterations < 0:
-        raise ValueError(f"iterations: expected None or at least 0, got {iterations}")
-    source, square = nearest_valid(valid)
-    limit = float("inf") if iterations is None else float(iterations) ** 2
-
-    def filled(name: str, value: Tensor) -> Tensor:
-        check(name, value, like=valid)
-        if value.ndim != 3 or value.shape[:2] != valid.shape:
-            raise ValueError(f"{name}: expected shape {(*valid.shape, 'C')}, got {tuple(value.shape)}")
-        result = value.detach().clone(memory_format=torch.contiguous_format)
-        _fill(result, source, square, limit)
-        return result
-
-    if isinstance(maps, Tensor):
-        return filled("maps", maps)
-    return {name: filled(f"maps[{name!r}]", value) for name, value in maps.items()}
-
-
-def _fill(value: Tensor, source: Tensor, square: Tensor, limit: float = float("inf")) -> None:
-    """Copy texels of ``value (H, W, C)``, in place, from those that :func:`nearest_valid` found within ``limit``."""
-    flat = value.view(-1, value.shape[2])
-    rows = ((source >= 0) & (square > 0.0) & (square <= limit)).reshape(-1).nonzero().squeeze(1)
-    flat.index_copy_(0, rows, flat.index_select(0, source.reshape(-1)[rows]))

@@ -18,13 +18,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reli3d._bridge import check, expect, full_precision, tensor_of
+from reli3d._bridge import Movable, check, expect, full_precision, tensor_of
 
 DEPTH_RATIO_MIN = 0.01  # least depth of points over their largest distance, for their box: below, rounding dominates
 
 
 @dataclass(frozen=True)
-class Camera:
+class Camera(Movable):
     """One pinhole camera, or a batch of cameras with the same image size.
 
     c2w: ``(..., 4, 4)`` float32 camera-to-world, OpenGL axes: +X right, +Y up, looks along -Z.  intrinsics: ``(...,
@@ -70,14 +70,6 @@ class Camera:
         f = 0.5 * width / torch.tan(torch.tensor(0.5 * fov_x, dtype=torch.float64, device="cpu")).item()
         row = torch.tensor([f, f, 0.5 * width, 0.5 * height], dtype=torch.float32, device=c2w.device)
         return cls(c2w, row.expand(*c2w.shape[:-2], 4).contiguous(), width, height)
-
-    def to(self, device: torch.device | str) -> "Camera":
-        """The same camera on ``device``."""
-        return Camera(self.c2w.to(device), self.intrinsics.to(device), self.width, self.height)
-
-    def detach(self) -> "Camera":
-        """The same camera without gradient."""
-        return Camera(self.c2w.detach(), self.intrinsics.detach(), self.width, self.height)
 
     def __getitem__(self, index) -> "Camera":
         """The cameras that ``index`` picks from the batch axes, as torch indexes."""

@@ -8,34 +8,9 @@ import threading
 import numpy as np
 import torch
 
-from reli3d.geometry.mesh import Mesh, weld, welded_faces
+from reli3d.geometry.mesh import Mesh, select_faces, weld, welded_faces
 
 _ONE_AT_A_TIME = threading.Lock()  # fast-simplification keeps its mesh in a global
-
-
-def _arrays(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Welded positions ``(W, 3)`` float32 and the faces ``(F, 3)`` int32 that are not degenerate, used ones only."""
-    if not bool(torch.isfinite(mesh.vertices.detach()).all()):
-        raise ValueError("mesh.vertices: expected finite positions, got NaN or infinity")
-    faces, sound = welded_faces(mesh)
-    faces = faces[sound]
-    if not len(faces):
-        raise ValueError("mesh: expected faces with three different corners, got none")
-    positions = mesh.vertices.detach().cpu().numpy()[weld(mesh.vertices)[0].cpu().numpy()]
-    return _used(positions, faces)
-
-
-def _used(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    used, faces = np.unique(faces, return_inverse=True)
-    return positions[used], faces.reshape(-1, 3).astype(np.int32)
-
-
-def _mesh(positions: np.ndarray, faces: np.ndarray, like: Mesh) -> Mesh:
-    device = like.vertices.device
-    return Mesh(
-        torch.from_numpy(np.array(positions, np.float32, order="C")).to(device),
-        torch.from_numpy(np.array(faces, np.int32, order="C")).to(device),
-    )
 
 
 def decimate(mesh: Mesh, faces: int) -> Mesh:
@@ -59,10 +34,23 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
         raise ImportError(
             "fast_simplification is not installed: pip install 'reli3d[mesh]'", name=error.name
         ) from error
-    positions, triangles = _arrays(mesh)
-    if len(triangles) <= faces:
-        return _mesh(positions, triangles, mesh)
+    if not bool(torch.isfinite(mesh.vertices.detach()).all()):
+        raise ValueError("mesh.vertices: expected finite positions, got NaN or infinity")
+    triangles, sound = welded_faces(mesh)
+    if not sound.any():
+        raise ValueError("mesh: expected faces with three different corners, got none")
+    first, _ = weld(mesh.vertices)
+    whole = _used(mesh.vertices.detach()[first].cpu().numpy(), triangles[sound])
+    if len(whole.faces) <= faces:
+        return whole.to(mesh.vertices.device)
+    positions = whole.vertices.numpy()
     center, size = positions.mean(0, dtype=np.float64), float(np.ptp(positions, axis=0).max())
     with _ONE_AT_A_TIME:  # unit size: the library's error thresholds are absolute
-        points, triangles = simplify((positions - center) / size, triangles, target_count=int(faces))
-    return _mesh(*_used(points * size + center, triangles), mesh)
+        points, triangles = simplify((positions - center) / size, whole.faces.numpy(), target_count=int(faces))
+    return _used(points * size + center, triangles).to(mesh.vertices.device)
+
+
+def _used(positions: np.ndarray, faces: np.ndarray) -> Mesh:
+    """Mesh of ``faces`` and the vertices that they use, on the CPU."""
+    whole = Mesh(torch.from_numpy(np.array(positions, np.float32, order="C")), torch.from_numpy(faces.astype(np.int32)))
+    return select_faces(whole, torch.ones(len(faces), dtype=torch.bool))

@@ -130,5 +130,4 @@ def _check_views(points: Tensor, distance: Tensor, camera: Camera) -> None:
 
 
 def _views(distance: Tensor, camera: Camera) -> list:
-    """Kernel arguments: the views' distances and cameras."""
     return [value.detach().contiguous() for value in (distance, camera.c2w, camera.intrinsics)]

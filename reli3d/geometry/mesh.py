@@ -4,14 +4,14 @@ Faces are counter-clockwise seen from outside.  Topology (components, report) re
 vertices at bit-identical positions are merged, because atlases and exporters split the vertices of a connected surface.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check, tensor_of
+from reli3d._bridge import Movable, check, tensor_of
 from reli3d.geometry.tangents import vertex_tangents
 from reli3d.geometry.topology import edges_of, graph_components, weld_rows
 
@@ -19,7 +19,7 @@ NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below whic
 
 
 @dataclass(frozen=True)
-class Mesh:
+class Mesh(Movable):
     """Triangle mesh on one device, with optional vertex attributes.
 
     vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32, counter-clockwise seen from outside.  normals: ``(V, 3)``
@@ -48,18 +48,6 @@ class Mesh:
             value = getattr(self, name)
             if value is not None:
                 check(name, value, shape=(len(self.vertices), last), like=self.vertices)
-
-    def to(self, device: torch.device | str) -> "Mesh":
-        """The same mesh on another device."""
-        return self._changed(lambda value: value.to(device))
-
-    def detach(self) -> "Mesh":
-        """The same mesh without gradients."""
-        return self._changed(lambda value: value.detach())
-
-    def _changed(self, change: Callable[[Tensor], Tensor]) -> "Mesh":
-        present = {f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None}
-        return Mesh(**{name: change(value) for name, value in present.items()})
 
     def with_normals(self) -> "Mesh":
         """The same mesh with :func:`vertex_normals`."""
@@ -176,6 +164,13 @@ def select_faces(mesh: Mesh, keep: Tensor) -> Mesh:
     return Mesh(mesh.vertices[used], new_index[faces.long()].reshape(-1, 3), *rest)
 
 
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """The concatenation of at least one mesh, with positions and faces only; face indices continue."""
+    starts = np.cumsum([0] + [len(m.vertices) for m in meshes])
+    faces = [m.faces + int(s) for m, s in zip(meshes, starts)]
+    return Mesh(torch.cat([m.vertices for m in meshes]), torch.cat(faces))
+
+
 def largest_components(mesh: Mesh, min_fraction: float = 0.02) -> Mesh:
     """The components with at least ``min_fraction`` of all faces, and always the largest one.
 
@@ -234,9 +229,3 @@ def watertight(mesh: Mesh) -> bool:
     """Whether the mesh has faces and every edge has an even number of them; only this field of :func:`report`."""
     faces, sound = welded_faces(mesh)
     return bool(sound.any() and (edges_of(faces[sound]).valence % 2 == 0).all())
-
-
-def volume(mesh: Mesh) -> Tensor:
-    """Signed volume of a closed mesh, a scalar tensor: positive for outward faces.  Differentiable."""
-    a, b, c = (mesh.vertices.index_select(0, mesh.faces[:, k]) for k in range(3))
-    return (a * torch.linalg.cross(b, c)).sum() / 6.0

@@ -178,7 +178,7 @@ class RayScene:
                 raise ValueError(f"faces: expected indices in [0, {len(vertices)}), got [{first}, {last}]")
         self.vertices = vertices.detach().clone().contiguous()
         self._cells = cells  # lower corner of the mesh, and quarters of its box per unit
-        self.scale = scale  # largest coordinate of the mesh: what offset_origin needs
+        self.scale = scale  # largest coordinate of the mesh: the step off a face is a multiple of it
 
     def _build(self) -> None:
         if self.faces.shape[0] == 0:
@@ -247,20 +247,3 @@ class RayScene:
 def _items(values: Tensor) -> np.ndarray:
     """``(N,)`` unchanged, ``(N, 2)`` float32 as ``(N,)`` of eight bytes, which numpy copies about 4 times faster."""
     return values.numpy() if values.ndim == 1 else values.view(torch.float64)[:, 0].numpy()
-
-
-def offset_origin(position: Tensor, ng: Tensor, direction: Tensor, *, scale: float = 1.0) -> Tensor:
-    """Origins ``(..., 3)`` for rays that start on a face and must not hit it.
-
-    position: ``(..., 3)`` on the face.  ng: ``(..., 3)`` unit geometric normal, on either side; 0 (a degenerate face)
-    leaves the position unchanged.  direction: ``(..., 3)`` of the ray.  scale: largest coordinate of the mesh
-    (``RayScene.scale``).  No gradient.
-    """
-    check("position", position, last=3)
-    check("ng", ng, last=3, like=position)
-    check("direction", direction, last=3, like=position)
-    shape = np.broadcast_shapes(position.shape, ng.shape, direction.shape)
-    ins = [v.detach().expand(shape).reshape(-1, 3).contiguous() for v in (position, ng, direction)]
-    out = empty((ins[0].shape[0],), wp.vec3, position.device)
-    launch(kernels.offset_origin_kernel, out.shape[0], [*ins, float(scale), out], position.device)
-    return out.reshape(shape)

@@ -13,6 +13,8 @@ from torch import Tensor
 from reli3d.geometry.mesh import Mesh, weld, welded_faces
 from reli3d.geometry.topology import edges_of
 
+STEP, PASS_BAND = 0.5, 0.1  # of Taubin smoothing, in units of the umbrella operator's eigenvalues
+
 
 @dataclass(frozen=True)
 class _Umbrella:
@@ -52,29 +54,21 @@ def _umbrella(mesh: Mesh) -> _Umbrella:
     return _Umbrella(label, weight, key - moved * n, start, inverse)
 
 
-def _smoothed(mesh: Mesh, steps: list[float]) -> Mesh:
-    if not steps or not len(mesh.faces):
-        return replace(mesh, normals=None, tangents=None)
-    operator = _umbrella(mesh)
-    start = positions = operator.welded(mesh.vertices)
-    for step in steps:
-        positions = positions + step * operator(positions)
-    vertices = mesh.vertices + (positions - start).index_select(0, operator.label)
-    return replace(mesh, vertices=vertices, normals=None, tangents=None)
-
-
-def taubin_smooth(mesh: Mesh, *, iterations: int = 10, step: float = 0.5, pass_band: float = 0.1) -> Mesh:
+def taubin_smooth(mesh: Mesh, *, iterations: int = 10) -> Mesh:
     """Taubin smoothing: ``iterations`` pairs of a shrinking and an inflating step, which preserve the volume.
 
-    The steps are ``step`` and ``mu`` with ``1 / step + 1 / mu = pass_band``; frequencies of the umbrella operator below
-    ``pass_band`` are kept or slightly amplified.  step: in (0, 1].  pass_band: in (0, 1 / step), small.  Vertices of
-    open borders are fixed.  Gradients reach the vertices.  On the CPU, neighbors are summed in a fixed order.  Raises
-    ValueError for values out of range.  Source: Taubin 1995, A signal processing approach to fair surface design.
+    The steps are ``STEP`` and ``mu`` with ``1 / STEP + 1 / mu = PASS_BAND``; frequencies of the umbrella operator below
+    ``PASS_BAND`` are kept or slightly amplified.  Vertices of open borders are fixed.  Gradients reach the vertices.
+    On the CPU, neighbors are summed in a fixed order.  Raises ValueError for negative ``iterations``.  Source: Taubin
+    1995, A signal processing approach to fair surface design.
     """
     if iterations < 0:
         raise ValueError(f"iterations: expected at least 0, got {iterations}")
-    if not 0.0 < step <= 1.0:
-        raise ValueError(f"step: expected a value in (0, 1], got {step}")
-    if not 0.0 < pass_band < 1.0 / step:
-        raise ValueError(f"pass_band: expected a value in (0, {1.0 / step:.4g}), got {pass_band}")
-    return _smoothed(mesh, [step, 1.0 / (pass_band - 1.0 / step)] * iterations)
+    if not iterations or not len(mesh.faces):
+        return replace(mesh, normals=None, tangents=None)
+    operator = _umbrella(mesh)
+    start = positions = operator.welded(mesh.vertices)
+    for step in [STEP, 1.0 / (PASS_BAND - 1.0 / STEP)] * iterations:
+        positions = positions + step * operator(positions)
+    vertices = mesh.vertices + (positions - start).index_select(0, operator.label)
+    return replace(mesh, vertices=vertices, normals=None, tangents=None)

@@ -56,7 +56,6 @@ class _Topology:
 
     @cached_property
     def surface(self) -> kernels.SurfaceCubes:
-        """The kernels' view of it."""
         names = ("cells", "rows", "resolved", "counts", "base", "slot")
         return struct_of(kernels.SurfaceCubes, **{name: getattr(self, name) for name in names})
 

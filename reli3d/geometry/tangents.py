@@ -65,27 +65,18 @@ def _any_orthogonal(n: Tensor) -> Tensor:
     return _unit(_flat(axis, n))[0]
 
 
-def _check_frame(normal: Tensor, tangent: Tensor) -> None:
-    check("normal", normal, last=3)
-    check("tangent", tangent, last=4, like=normal)
-
-
-def _frame(normal: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    t, n = tangent[..., :3], normal
-    b = torch.linalg.cross(n, t) * tangent[..., 3:]
-    return t, b, n
-
-
 def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     """Encodes unit world-space normals ``world (..., 3)`` as normal map values ``(..., 3)`` in [0, 1].
 
     normal: ``(..., 3)`` unit, tangent: ``(..., 4)`` with unit direction, both interpolated at the texel.  The frame is
-    inverted, not transposed, because interpolated tangents are not exactly orthogonal and :func:`decode_normals` must
-    return ``world``.  Normals below the surface are clamped to the tangent plane.  Gradients reach ``world``.
+    inverted, not transposed, because interpolated tangents are not exactly orthogonal and renderers must decode
+    ``world``.  Normals below the surface are clamped to the tangent plane.  Gradients reach ``world``.
     """
-    _check_frame(normal, tangent)
+    check("normal", normal, last=3)
+    check("tangent", tangent, last=4, like=normal)
     check("world", world, last=3, like=normal)
-    t, b, n = _frame(normal.detach(), tangent.detach())
+    t, n = tangent.detach()[..., :3], normal.detach()
+    b = torch.linalg.cross(n, t) * tangent.detach()[..., 3:]
     tt, tn, nn, wt, wn, wb, bb = (
         (x * y).sum(-1) for x, y in ((t, t), (t, n), (n, n), (world, t), (world, n), (world, b), (b, b))
     )
@@ -93,13 +84,3 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     z = ((tt * wn - tn * wt) / determinant).clamp(min=0.0)
     local = torch.stack(torch.broadcast_tensors((nn * wt - tn * wn) / determinant, wb / bb.clamp(min=EPS), z), -1)
     return torch.nn.functional.normalize(local, dim=-1, eps=EPS) * 0.5 + 0.5
-
-
-def decode_normals(encoded: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
-    """Decodes normal map values ``(..., 3)`` to unit world-space normals; inverse of :func:`encode_normals`."""
-    _check_frame(normal, tangent)
-    check("encoded", encoded, last=3, like=normal)
-    t, b, n = _frame(normal, tangent)
-    local = encoded * 2.0 - 1.0
-    world = local[..., :1] * t + local[..., 1:2] * b + local[..., 2:] * n
-    return torch.nn.functional.normalize(world, dim=-1, eps=EPS)

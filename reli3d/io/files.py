@@ -4,11 +4,13 @@ import contextlib
 import errno
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from reli3d.errors import InputError, printable, shown
 
-__all__ = ["InputError", "file_size", "printable", "read_bytes", "replacing", "shown", "write_bytes"]
+__all__ = ["InputError", "file_size", "opened", "printable", "read_bytes", "replacing", "shown", "write_bytes"]
 
 
 def read_bytes(path: str | os.PathLike, limit: int) -> bytes:
@@ -16,9 +18,16 @@ def read_bytes(path: str | os.PathLike, limit: int) -> bytes:
     size = file_size(path)
     if size > limit:
         raise InputError(path, f"expected at most {limit} bytes, got {size}; give a smaller file")
+    with opened(path) as file:
+        return file.read(size)  # not the limit: Python would allocate it
+
+
+@contextlib.contextmanager
+def opened(path: str | os.PathLike, mode: str = "rb", **options) -> Iterator[Any]:
+    """The file, open for reading; turns an OSError of the block into an InputError.  options: of Python's ``open``."""
     try:
-        with open(path, "rb") as file:
-            return file.read(size)  # not the limit: Python would allocate it
+        with open(path, mode, **options) as file:
+            yield file
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror or error}); check its permissions") from None
 

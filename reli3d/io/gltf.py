@@ -99,7 +99,6 @@ class Document:
         return found
 
     def fail(self, field: str, expected: str, got: object, fix: str = "export the file again") -> NoReturn:
-        """Raises the InputError of ``field``."""
         raise InputError(self.path, f"{field}: {expected}, got {shown(got)}; {fix}")
 
     def get(self, node: dict, key: str, kind: type, field: str, default=None):

@@ -17,7 +17,7 @@ from torch import Tensor
 from reli3d._bridge import expect
 from reli3d.errors import InputError, shown
 from reli3d.io.exr import read_exr
-from reli3d.io.files import file_size, replacing, write_bytes
+from reli3d.io.files import file_size, opened, replacing, write_bytes
 from reli3d.io.rgbe import read_rgbe, rgbe_bytes
 from reli3d.render.environment import Environment
 
@@ -75,11 +75,8 @@ def read_hdr_image(path: str | os.PathLike, *, notes: list[str] | None = None) -
     converted.  ``notes`` and errors as in :func:`read_environment`.
     """
     file_size(path)  # raises for a pipe, which would block
-    try:
-        with open(path, "rb") as file:
-            start = file.read(4)
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror or error}); check its permissions") from None
+    with opened(path) as file:
+        start = file.read(4)
     found: list[str] = []
     pixels, matrix = (read_exr if start == b"\x76\x2f\x31\x01" else read_rgbe)(path, MAX_PIXELS, found)
     if np.isnan(pixels).any():

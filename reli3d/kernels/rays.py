@@ -88,19 +88,6 @@ def occluded_kernel(
 
 
 @wp.kernel
-def offset_origin_kernel(
-    start: int,
-    position: wp.array[wp.vec3],
-    ng: wp.array[wp.vec3],
-    direction: wp.array[wp.vec3],
-    scale: float,
-    origin: wp.array[wp.vec3],  # out
-):
-    i = start + wp.tid()
-    origin[i] = offset_origin(position[i], ng[i], direction[i], scale)
-
-
-@wp.kernel
 def sight_kernel(
     start: int,
     position: wp.array[wp.vec3],

@@ -1,4 +1,4 @@
-"""Spherical Gaussians: value, integrals against a clamped cosine, and direct light of the material from a mixture.
+"""Spherical Gaussians: integrals against a clamped cosine, and direct light of the material from a mixture.
 
 A lobe is ``amplitude exp(sharpness (axis . w - 1))`` with a unit axis.  Directions are unit.  Everything is
 differentiable; loops over lobes carry a sum and nothing else, which Warp's adjoint gets right.
@@ -19,13 +19,6 @@ COSINE_SHARPNESS = wp.constant(2.133)  # of the Gaussian nearest to a clamped co
 # (1 + x)^-2 = sum of weight exp(-rate x), fitted over x in [0, 300] to 6e-4: GGX's slope distribution as normals
 GGX_WEIGHT = wp.constant(wp.vec4(0.01271983, 0.15480422, 0.51788954, 0.31433217))
 GGX_RATE = wp.constant(wp.vec4(0.08227587, 0.41751521, 1.38313102, 3.80806021))
-
-
-@wp.func
-def eval_lobe(axis: wp.vec3, sharpness: float, direction: wp.vec3) -> float:
-    """Value of a lobe of amplitude 1.  The cosine enters as a squared chord, which keeps digits near the axis."""
-    chord = direction - axis
-    return wp.exp(-0.5 * sharpness * wp.dot(chord, chord))
 
 
 @wp.func
@@ -123,38 +116,6 @@ def shade_lobe(
     for j in range(4):
         out = out + specular_lobe(n, wo, f0, alpha, axis, s, GGX_RATE[j], GGX_WEIGHT[j])
     return out
-
-
-@wp.kernel
-def eval_sg_kernel(
-    start: int,
-    axis: wp.array[wp.vec3],
-    sharpness: wp.array[float],
-    amplitude: wp.array[wp.vec3],
-    directions: wp.array[wp.vec3],
-    out: wp.array[wp.vec3],  # out
-):
-    i = start + wp.tid()
-    total = wp.vec3(0.0, 0.0, 0.0)
-    for k in range(axis.shape[0]):
-        total += amplitude[k] * eval_lobe(axis[k], sharpness[k], directions[i])
-    out[i] = total
-
-
-@wp.kernel
-def irradiance_sg_kernel(
-    start: int,
-    axis: wp.array[wp.vec3],
-    sharpness: wp.array[float],
-    amplitude: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    out: wp.array[wp.vec3],  # out
-):
-    i = start + wp.tid()
-    total = wp.vec3(0.0, 0.0, 0.0)
-    for k in range(axis.shape[0]):
-        total += amplitude[k] * cosine_integral(sharpness[k], wp.dot(normals[i], axis[k]))
-    out[i] = total
 
 
 @wp.kernel

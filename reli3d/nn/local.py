@@ -11,20 +11,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from reli3d._bridge import mapped
 from reli3d.geometry.camera import Camera, image_plane
+from reli3d.geometry.hull import hull_distance, hull_grid
 from reli3d.geometry.projection import gather_views
 from reli3d.kernels.view_features import CONFIDENT_WEIGHT
 from reli3d.nn.blocks import in_rows, linear_of
 from reli3d.nn.cost_volume import CostVolume
-from reli3d.nn.field import Field, PointMaterial, bound_sdf, grid_bound_sdf
 from reli3d.nn.heads import ROUGHNESS_MIN, color_logit, mlp
 from reli3d.nn.light_features import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.light_map import LightMap
@@ -41,6 +41,7 @@ from reli3d.nn.view_lookup import fuse_views, summarize_views
 from reli3d.nn.volume import HULL_SCALE, FeatureVolume
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
+from reli3d.render.points import SurfacePoints
 
 LIGHT_ROWS = 16  # rows of the map whose irradiance the material heads read
 TOKEN_EXTRA = 4  # depth and world normal, appended to the pyramid's features
@@ -71,7 +72,7 @@ class PixelMaps:
 
     def of_views(self, count: int) -> PixelMaps:
         """The maps of the first ``count`` views."""
-        return PixelMaps(**{f.name: getattr(self, f.name)[:count] for f in fields(self)})
+        return mapped(self, lambda values: values[:count])
 
     @staticmethod
     def of(raw: Tensor, span: Tensor, camera: Camera, mean: Tensor) -> PixelMaps:
@@ -293,9 +294,10 @@ def pixel_colors(images: Tensor, masks: Tensor, camera: Camera) -> tuple[Tensor,
 
 
 @dataclass(frozen=True)
-class LocalField(Field):
-    """Output of a :class:`LocalReconstructor` for one object."""
+class LocalField:
+    """Output of a :class:`LocalReconstructor` for one object, in the model's frame."""
 
+    maps: ViewMaps
     model: LocalReconstructor
     pixels: PixelMaps
     color: Tensor  # (V, P, P, 3) sRGB, observed
@@ -305,23 +307,26 @@ class LocalField(Field):
     shading: Shading | None = None
     inference: bool = False  # by encode_for_inference: points are evaluated without gradient
 
-    reads_views: ClassVar[bool] = True
-
-    def bound(self, points: Tensor, far: float = math.inf) -> Tensor:
+    def bound(self, points: Tensor) -> Tensor:
         """Signed distance ``(N,)`` to the visual hull in units of ``softness``, a lower bound of :meth:`sdf`.
 
-        Where it exceeds ``far``, the result is any value above ``far``.  No gradient.
+        Negative inside.  No gradient.
         """
-        return bound_sdf(self.maps, points, self.model.preset.softness, far)
+        return -hull_distance(points, self.maps.silhouette, self.maps.camera) / self.model.preset.softness
 
-    def grid_bound(self, axis: Tensor, far: float = math.inf) -> Tensor:
-        """:meth:`bound` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; axis: ``(n,)`` ascending."""
-        return grid_bound_sdf(self.maps, axis, self.model.preset.softness, far)
+    def grid_bound(self, axis: Tensor, far: float) -> Tensor:
+        """:meth:`bound` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; axis: ``(n,)`` ascending.
+
+        Where it exceeds ``far``, the result is any value above ``far``.
+        """
+        softness = self.model.preset.softness
+        return -hull_grid(axis, self.maps.silhouette, self.maps.camera, far=far * softness) / softness
 
     def _rows(self, evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:
         return in_rows(evaluate, *inputs) if self.inference else evaluate(*inputs)
 
     def free_sdf(self, points: Tensor) -> Tensor:
+        """Predicted field values ``(N,)``, not clamped to the visual hull.  Gradients reach the network."""
         return self.sdf_within(points, self.bound(points))
 
     def sdf_within(self, points: Tensor, bound: Tensor) -> Tensor:
@@ -392,12 +397,17 @@ class LocalField(Field):
             irradiance = Environment(self.radiance_map(LIGHT_ROWS).detach().contiguous()).irradiance()
             return replace(self, shading=Shading(irradiance, observed, palette_of(color, unlit, visible_in_any)))
 
-    def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
+    def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> SurfacePoints:
+        """Surface points with material.
+
+        position, geometric normal: ``(N, 3)``, unit.  visible: ``(N, V)``, 1 where the view sees the point.
+        """
+
         def evaluate(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
             fused = self.fused(position, normal, visible)
             return _material(fused, self._heads(fused, position, normal, visible), normal)
 
-        return PointMaterial(**self._rows(evaluate, position, normal, visible))
+        return SurfacePoints(position, normal, **self._rows(evaluate, position, normal, visible))
 
     def heads(self, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
         """Raw head outputs ``(N, HEAD_OUTPUTS)`` at surface points, for :meth:`material_from_heads`.
@@ -411,13 +421,13 @@ class LocalField(Field):
 
         return self._rows(evaluate, position, normal, visible)["heads"]
 
-    def material_from_heads(self, heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
+    def material_from_heads(self, heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> SurfacePoints:
         """:meth:`material` at surface points with given, possibly interpolated ``heads (N, HEAD_OUTPUTS)``."""
 
         def evaluate(heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
             return _material(self.fused(position, normal, visible), heads, normal)
 
-        return PointMaterial(**self._rows(evaluate, heads, position, normal, visible))
+        return SurfacePoints(position, normal, **self._rows(evaluate, heads, position, normal, visible))
 
     def _heads(self, fused: Fused, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
         if self.shading is None:
@@ -432,6 +442,7 @@ class LocalField(Field):
         return torch.cat([self.model.color(features), self.model.surface(features)], -1)
 
     def radiance_map(self, height: int | None = None) -> Tensor:
+        """Linear radiance ``(H, 2H, 3)``, upper edge +Y, horizontal center +X; default height: the preset's."""
         log = self.log_light
         if height is not None and height < log.shape[1]:
             return functional.adaptive_avg_pool2d(log.exp()[None], (height, 2 * height))[0].permute(1, 2, 0)

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from reli3d._bridge import mapped
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.nn.blocks import linear_of
 from reli3d.nn.camera import CameraEmbedder, camera_vector
@@ -34,7 +35,7 @@ class Code:
 
     def of(self, b: int) -> "Code":
         """Object ``b`` alone, as a batch of one."""
-        return Code(*(getattr(self, field.name)[b : b + 1] for field in fields(self)))
+        return mapped(self, lambda values: values[b : b + 1])
 
 
 class Reconstructor(nn.Module):

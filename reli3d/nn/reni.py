@@ -4,8 +4,8 @@ Source: Gardner, Egger and Smith 2023, "RENI++", arXiv 2311.09361, in the form a
 published with ReLi3D.  An environment is a set of latent 3-vectors; rotating them about the vertical rotates the map.
 The decoder uses a z-up frame, D = (z, x, y) of the y-up world direction (x, y, z).  It is evaluated in float32.
 
-The published maps have -Z at the horizontal center and +X right of it; :func:`from_published` and :func:`to_published`
-convert.  Maps of this package are those of :mod:`reli3d.render.latlong`.
+The published maps have -Z at the horizontal center and +X right of it; :func:`~reli3d.render.latlong.quarter_turn`
+converts.  Maps of this package are those of :mod:`reli3d.render.latlong`.
 """
 
 import math
@@ -21,16 +21,6 @@ from reli3d.render.latlong import lat_long_directions, quarter_turn
 FREQUENCIES = (1.0, 4.0)  # of the positional encoding, without a factor of pi
 VN_EPS = 1.0e-6  # floor of the published vector-neuron ReLU
 NORM2_MIN = 1.0e-20  # squared length: keeps the gradient of the square root finite at a zero latent
-
-
-def from_published(maps: Tensor) -> Tensor:
-    """Lat-long maps ``(..., H, 2H, C)`` with -Z at the horizontal center, as published, in our mapping; H even."""
-    return quarter_turn(maps, -1)
-
-
-def to_published(maps: Tensor) -> Tensor:
-    """Inverse of :func:`from_published`."""
-    return quarter_turn(maps, 1)
 
 
 def reni_frame(directions: Tensor) -> Tensor:
@@ -162,7 +152,7 @@ class EnvironmentDecoder(nn.Module):
         self.field = ReniField(sizes)
         directions = torch.empty(2 * sizes.height**2, 3)
         if directions.device.type != "meta":
-            directions = to_published(reni_frame(lat_long_directions(sizes.height))).flatten(0, 1)
+            directions = quarter_turn(reni_frame(lat_long_directions(sizes.height)), 1).flatten(0, 1)
         self.register_buffer("sample_directions", directions)
 
     def forward(

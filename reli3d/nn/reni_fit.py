@@ -1,7 +1,6 @@
 """RENI++ latents of a given map, by gradient descent through the frozen decoder."""
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -15,21 +14,12 @@ COSINE = 0.3  # weight of the color cosine loss
 PRIOR = 1e-4  # weight of the squared latents, which had a normal prior in training
 
 
-@dataclass(frozen=True)
-class LightFit:
-    """Arguments of ``EnvironmentDecoder``; ``error`` is the mean over the sphere of |log radiance - log map|."""
-
-    latent: Tensor  # (L, 3)
-    rotation: Tensor  # (3, 3), the identity: rotation is absorbed by the latents
-    strength: Tensor  # ()
-    error: float
-
-
 def fit_latent(
     decoder: EnvironmentDecoder, radiance: Tensor, *, steps: int = 500, rays: int = 512, seed: int = 0
-) -> LightFit:
-    """Fits latents and strength so that the decoded map approximates ``radiance``.
+) -> tuple[Tensor, Tensor, float]:
+    """Latents ``(L, 3)`` and strength ``()`` of the decoded map that approximates ``radiance``, and the error.
 
+    The error is the mean over the sphere of |log radiance - log map|; the latents absorb any rotation.
     radiance: ``(H, 2H, 3)`` linear, nonnegative, in the layout of :mod:`reli3d.render.latlong`, on the decoder's
     device; H at least 8.  steps: of Adam, each on ``rays`` texels sampled uniformly over the sphere.  The strength is
     initialized to the logarithm of the geometric mean.  The loss is the absolute difference of logarithms, with a floor
@@ -64,8 +54,7 @@ def fit_latent(
     with torch.no_grad():
         difference = (torch.logaddexp(logarithm(directions), floor) - (target + FLOOR).log()).abs().mean(-1)
         error = float((difference * weight).sum() / weight.sum())
-        eye = torch.eye(3, device=radiance.device, dtype=torch.float32)
-        return LightFit(latent.detach(), eye, strength.detach() + mean.log(), error)
+        return latent.detach(), strength.detach() + mean.log(), error
 
 
 def _rays(decoder: EnvironmentDecoder, radiance: Tensor) -> tuple[Tensor, Tensor, Tensor]:

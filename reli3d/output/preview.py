@@ -154,7 +154,6 @@ def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
 
 
 def _lit(radiance: Tensor, alpha: Tensor) -> Tensor:
-    """Tile of premultiplied linear radiance."""
     return _on_background(linear_to_srgb((radiance / alpha.clamp(min=1e-3)[..., None]).clamp(0, 1)), alpha)
 
 

@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -77,18 +77,6 @@ def peak_memory_mib() -> float | None:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20, 1)
 
 
-@dataclass(frozen=True)
-class Encoded:
-    """Contents of the files of a result, except the preview.  Calls block until the content is ready.
-
-    placed: ``mesh.glb``.  page: ``viewer.html``, in the frame of the mesh.
-    """
-
-    asset: Asset
-    placed: Callable[[], bytes]
-    page: Callable[[], str]
-
-
 def encode(
     asset: Asset,
     views: Views,
@@ -98,8 +86,10 @@ def encode(
     before: Asset | None = None,
     translation: Sequence[float] = (0.0, 0.0, 0.0),
     scene: RayScene | None = None,
-) -> Encoded:
-    """Starts encoding a result in the pool; the encoders release the interpreter lock.
+) -> tuple[Callable[[], bytes], Callable[[], str]]:
+    """Starts encoding ``mesh.glb`` and ``viewer.html`` in the pool; the encoders release the interpreter lock.
+
+    The results block until the content is ready.  The page is in the frame of the mesh.
 
     views: the input views, in the frame of ``asset``.  record: content of ``run_info.json``; its frames and weights are
     also stored in ``mesh.glb``.  name: title of the page.  before: the asset before refinement, also shown on the page.
@@ -112,7 +102,7 @@ def encode(
     glb = submit(partial(glb_bytes, asset, extras=extras), device)
     moved = partial(glb_bytes, asset, extras=extras, translation=translation)
     stops = submit(partial(photograph_stops, views), device)
-    started = None if before is None else submit(partial(_shown, before), device)
+    started = None if before is None else submit(lambda: Shown(glb_bytes(before), shadow(before.mesh)), device)
 
     def page() -> str:
         # In a thread of the pool: may wait only for tasks that were submitted before it and that wait for no other.
@@ -124,32 +114,35 @@ def encode(
         return viewer_page(printable(name), shown, asset.light.radiance, middle, radius, stops())
 
     placed = submit(moved, device) if any(translation) else glb
-    return Encoded(asset, placed, submit(page, device))
-
-
-def _shown(asset: Asset) -> Shown:
-    return Shown(glb_bytes(asset), shadow(asset.mesh))
+    return placed, submit(page, device)
 
 
 def write_results(
-    replacing: Callable, encoded: Encoded, sheet: np.ndarray, info: dict, *, comparison: np.ndarray | None = None
+    replacing: Callable,
+    asset: Asset,
+    glb: Callable[[], bytes],
+    page: Callable[[], str],
+    sheet: np.ndarray,
+    info: dict,
+    *,
+    comparison: np.ndarray | None = None,
 ) -> None:
     """Writes :data:`FILES`; on an error the folder is unchanged.  Raises OSError, ValueError.
 
-    replacing: from :func:`claim`.  sheet: contact sheet of the asset, from :func:`~reli3d.output.preview.preview`.
-    info: content of ``run_info.json``, to which the environment convention is added.  comparison: contact sheet of a
-    refinement.
+    replacing: from :func:`claim`.  glb, page: from :func:`encode`.  sheet: contact sheet of the asset, from
+    :func:`~reli3d.output.preview.preview`.  info: content of ``run_info.json``, to which the environment convention is
+    added.  comparison: contact sheet of a refinement.
     """
-    light = encoded.asset.light
+    light = asset.light
     info = {**info, "environment_centre": "+X"}  # a key that other programs read
     with replacing() as new:
         (new / "preview.png").write_bytes(png_bytes(sheet))
-        (new / "mesh.glb").write_bytes(encoded.placed())
+        (new / "mesh.glb").write_bytes(glb())
         for name in ("environment.exr", "environment.hdr"):
             write_environment(new / name, light)
         if comparison is not None:
             write_png(new / COMPARISON, comparison)
-        (new / "viewer.html").write_text(encoded.page(), encoding="utf-8")
+        (new / "viewer.html").write_text(page(), encoding="utf-8")
         (new / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
 
 
@@ -172,11 +165,9 @@ def frame_record(
 
 
 def weights_record(manifest: Manifest, digest: str) -> dict:
-    """Name, hash and license of the weights."""
     return {"file": Path(manifest.path).name, "sha256": digest, "license": manifest.license}
 
 
 def versions() -> dict[str, str]:
-    """Versions of this package and of its numerical dependencies."""
     others = {name: version(name) for name in ("torch", "warp-lang", "embreex", "numpy")}
     return {"reli3d": reli3d.__version__, **others}  # also from a checkout that is not installed

@@ -1,13 +1,12 @@
 """Assets: a mesh with textures and an environment."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check, expect, present, tensor_of
+from reli3d._bridge import Movable, check, expect, present, tensor_of
 from reli3d.geometry.mesh import Mesh
 from reli3d.render.environment import Environment
 
@@ -17,7 +16,7 @@ KEPT = 2048  # texels a side up to which lookups are kept: 50 MB
 
 
 @dataclass(frozen=True, repr=False)
-class TextureSet:
+class TextureSet(Movable):
     """Metallic-roughness textures of one mesh: square float32 maps of equal size, with values in [0, 1].
 
     Row 0 is v = 0 (glTF: v down), texel centers at +0.5.  base_color: ``(T, T, 3)``, linear.  roughness (perceptual),
@@ -94,29 +93,17 @@ class TextureSet:
             object.__setattr__(self, "_rough_metal", (written, values))
         return values
 
-    def to(self, device: torch.device | str) -> "TextureSet":
-        """The same maps on ``device``."""
-        return self._changed(lambda value: value.to(device))
-
-    def detach(self) -> "TextureSet":
-        """The same maps without gradient."""
-        return self._changed(lambda value: value.detach())
-
-    def _changed(self, change: Callable[[Tensor], Tensor]) -> "TextureSet":
-        maps: dict[str, Any] = {f.name: change(getattr(self, f.name)) for f in fields(self) if f.name != "wrap"}
-        return replace(self, **maps)
-
     def __repr__(self) -> str:
         return f"TextureSet({self.size} x {self.size} texels, {self.base_color.device})"
 
 
 @dataclass(frozen=True, repr=False)
-class Asset:
+class Asset(Movable):
     """A relightable object: mesh, textures and the estimated input lighting, if known.
 
     mesh: a :class:`~reli3d.geometry.mesh.Mesh`, with ``uv`` if there are textures (:func:`reli3d.unwrap`).  textures: a
     :class:`TextureSet`; None: a gray dielectric.  environment: an :class:`~reli3d.render.environment.Environment` or
-    None.  ``.to(device)`` and ``.detach()`` return copies.  Gradients pass through.  Raises TypeError for a wrong type.
+    None.  Methods: ``.to(device)``, ``.detach()``.  Gradients pass through.  Raises TypeError for a wrong type.
 
     >>> asset = reli3d.Asset(mesh, reli3d.TextureSet(torch.full((64, 64, 3), 0.5), roughness=0.4, metallic=0.0))
     >>> image = reli3d.render_asset(asset, camera, light)
@@ -130,18 +117,6 @@ class Asset:
         for name, kind in (("mesh", Mesh), ("textures", TextureSet), ("environment", Environment)):
             if name == "mesh" or getattr(self, name) is not None:
                 expect(name, getattr(self, name), kind)
-
-    def to(self, device: torch.device | str) -> "Asset":
-        """The same asset on ``device``."""
-        return self._changed(lambda part: part.to(device))
-
-    def detach(self) -> "Asset":
-        """The same asset without gradient."""
-        return self._changed(lambda part: part.detach())
-
-    def _changed(self, change: Callable[[Any], Any]) -> "Asset":
-        textures = self.textures and change(self.textures)  # a renderer takes an asset without textures too
-        return Asset(change(self.mesh), textures, self.environment and change(self.environment))
 
     @property
     def light(self) -> Environment:

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from reli3d._bridge import (
     SLICE_MIN,
+    Movable,
     check,
     empty,
     full_precision,
-    indexed,
     launch,
     once_differentiable,
     over_slices,
@@ -46,7 +46,7 @@ class EnvironmentCDF:
 
 
 @dataclass(frozen=True)
-class Environment:
+class Environment(Movable):
     """Distant lighting as a lat-long map ``radiance (H, W, 3)``, normally W = 2 H, linear Rec. 709 radiance.
 
     The upper edge is +Y, the horizontal center (the border of columns W/2 - 1 and W/2) is +X, and +Z is right of the
@@ -73,14 +73,6 @@ class Environment:
         """Uniform lighting with radiance ``rgb (3,)``."""
         check("rgb", rgb, last=3)
         return cls(rgb.expand(height, 2 * height, 3).contiguous())
-
-    def to(self, device: torch.device | str) -> "Environment":
-        """The environment on ``device``; ``self``, with its CDF, if it is already there."""
-        return self if indexed(torch.device(device)) == self.radiance.device else Environment(self.radiance.to(device))
-
-    def detach(self) -> "Environment":
-        """The environment without gradient."""
-        return Environment(self.radiance.detach())
 
     def lookup(self, directions: Tensor) -> Tensor:
         """Radiance ``(..., 3)`` from unit ``directions (..., 3)``: bilinear between texel centers, periodic in azimuth.

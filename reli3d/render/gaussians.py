@@ -1,4 +1,4 @@
-"""Lighting as a mixture of spherical Gaussians: value, irradiance and shading in closed form.
+"""Lighting as a mixture of spherical Gaussians: shading in closed form.
 
 A lobe is ``amplitude exp(sharpness (axis . w - 1))``; formulas in ``reli3d.kernels.sg``.  Shading has neither shadows
 nor Monte Carlo noise: for the early stages of an optimization, it is a smooth function of lighting, normal and
@@ -33,23 +33,6 @@ class SphericalGaussians:
         shapes = tuple(self.axis.shape), tuple(self.sharpness.shape), tuple(self.amplitude.shape)
         if shapes != ((count, 3), (count,), (count, 3)):
             raise ValueError(f"axis, sharpness, amplitude: expected (K, 3), (K,), (K, 3), got {shapes}")
-
-    def lookup(self, directions: Tensor) -> Tensor:
-        """Radiance ``(..., 3)`` from unit ``directions (..., 3)``.  Gradients reach all lobes and the directions."""
-        return self._sum(kernels.eval_sg_kernel, "directions", directions)
-
-    def irradiance(self, normals: Tensor) -> Tensor:
-        """Irradiance ``(..., 3)`` [radiance times sr] at unit ``normals (..., 3)``.
-
-        Gradients reach all lobes and the normals.  The error is below 0.2 % of a lobe's maximum.
-        """
-        return self._sum(kernels.irradiance_sg_kernel, "normals", normals)
-
-    def _sum(self, kernel, name: str, at: Tensor) -> Tensor:
-        check(name, at, last=3, like=self.axis)
-        flat, n = at.reshape(-1, 3), at.numel() // 3
-        (out,) = call(kernel, n, [self.axis, self.sharpness, self.amplitude, flat], [(n,)], shared=(0, 1, 2))
-        return out.reshape(at.shape)
 
 
 def shade_gaussians(points: SurfacePoints, wo: Tensor, light: SphericalGaussians) -> Tensor:

@@ -15,6 +15,7 @@ from torch.nn.functional import normalize
 
 from reli3d._bridge import expect, full_precision
 from reli3d.geometry.camera import Camera, box_of, camera_rays
+from reli3d.geometry.mesh import joined
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
@@ -225,11 +226,7 @@ def joined_scene(parts: Sequence[Asset]) -> RayScene:
     """Acceleration structure over all ``parts``; face indices continue from one part to the next."""
     if not parts:
         raise ValueError("parts: expected at least one asset, got none")
-    first = [0]
-    for part in parts:
-        first.append(first[-1] + len(part.mesh.vertices))
-    faces = torch.cat([part.mesh.faces + k for part, k in zip(parts, first)])
-    return RayScene(torch.cat([part.mesh.vertices.detach() for part in parts]), faces)
+    return RayScene(joined([part.mesh.detach() for part in parts]))
 
 
 def _points(parts: Sequence[Asset], face: Tensor, bary: Tensor) -> SurfacePoints:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check, tensor_of
+from reli3d._bridge import Movable, check, mapped, tensor_of
 
 UNIT_TOLERANCE = 1e-4  # of a length from 1: float32 interpolation and rotation err by 1e-6
 SCALAR_VALUES = ("base_color", "roughness", "metallic")  # may be a plain number: gray, or the same everywhere
 
 
 @dataclass(frozen=True)
-class SurfacePoints:
+class SurfacePoints(Movable):
     """Geometry and material of N surface points, float32, world frame.
 
     position: ``(N, 3)``.  ng: ``(N, 3)`` geometric normal, unit, outward.  normal: ``(N, 3)`` shading normal, unit.
@@ -58,15 +58,7 @@ class SurfacePoints:
 
     def __getitem__(self, rows: Tensor | slice) -> "SurfacePoints":
         """The points of ``rows``: a slice, indices or a mask."""
-        return SurfacePoints(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    def detach(self) -> "SurfacePoints":
-        """The same points without gradient."""
-        return SurfacePoints(*(getattr(self, f.name).detach() for f in fields(self)))
-
-    def to(self, device: torch.device | str) -> "SurfacePoints":
-        """The same points on ``device``."""
-        return SurfacePoints(*(getattr(self, f.name).to(device) for f in fields(self)))
+        return mapped(self, lambda values: values[rows])
 
 
 @torch.no_grad()

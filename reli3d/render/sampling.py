@@ -14,17 +14,11 @@ from reli3d.kernels import microfacet
 
 
 def sample_cosine(u: Tensor) -> Tensor:
-    """Cosine-weighted directions ``(..., 3)`` for ``u (..., 2)``; density: :func:`pdf_cosine`.  No gradient."""
+    """Cosine-weighted directions ``(..., 3)`` for ``u (..., 2)``; density: cos / pi.  No gradient."""
     check("u", u, last=2)
     square, angle = u.detach()[..., 0], 2.0 * torch.pi * u.detach()[..., 1]
     radius = square.sqrt()
     return torch.stack([radius * angle.cos(), radius * angle.sin(), (1.0 - square).sqrt()], -1)
-
-
-def pdf_cosine(wi: Tensor) -> Tensor:
-    """Density cos / pi ``(...)`` [1/sr] of :func:`sample_cosine` at ``wi (..., 3)``; 0 below the horizon."""
-    check("wi", wi, last=3)
-    return wi[..., 2].clamp(min=0.0) / torch.pi
 
 
 def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:

@@ -33,11 +33,6 @@ class OccupancyGrid:
             raise ValueError(f"radius: expected a positive number, got {self.radius}")
 
     @classmethod
-    def full(cls, resolution: int, radius: float, device: torch.device | None = None) -> "OccupancyGrid":
-        """Grid with every cell occupied."""
-        return cls(torch.ones(resolution, resolution, resolution, dtype=torch.bool, device=device), radius)
-
-    @classmethod
     def of_density(
         cls,
         field: Callable[[Tensor], Tensor],
@@ -55,7 +50,7 @@ class OccupancyGrid:
         k = (torch.arange(2 * resolution + 1, device=device, dtype=torch.float32) / resolution - 1.0) * radius
         values = []
         with torch.no_grad():
-            points = torch.stack(torch.meshgrid(k, k, k, indexing="ij"), -1).reshape(-1, 3)
+            points = torch.cartesian_prod(k, k, k)
             for part in points.split(CHUNK):
                 values.append(field(part) > threshold)
         fine = torch.cat(values).reshape(1, 1, *(2 * resolution + 1,) * 3).float()

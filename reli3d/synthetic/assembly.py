@@ -33,7 +33,6 @@ class Assembly:
         return self.part(str(self.rng.choice(roles, p=p)))
 
     def add(self, solid: Manifold, part: int, at: Sequence[float] | np.ndarray | None = None) -> None:
-        """Adds ``solid``, translated by ``at``."""
         self._solids.append(self._tagged(solid, part, at))
 
     def add_labeled(self, vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> None:
@@ -78,7 +77,6 @@ class Assembly:
             self.add(solid.rotate((0.0, 360.0 * k / count, 0.0)), part)
 
     def joined(self) -> Manifold:
-        """Union of everything."""
         if not self._solids:
             raise ValueError("assembly: expected at least one solid, got none")
         solid = self._solids[0] if len(self._solids) == 1 else Manifold.batch_boolean(self._solids, OpType.Add)

@@ -1,7 +1,7 @@
 """Procedural objects for training: a closed mesh, its parts and their materials from one seed.
 
-The same seed gives the same object.  ``TRAINING_SEEDS``, ``VALIDATION_SEEDS`` and ``TEST_SEEDS`` are disjoint.  Frame:
-right-handed, +Y up, centered, longest side 1, inside the sphere of radius 0.87 of the network's frame.
+The same seed gives the same object.  ``VALIDATION_SEEDS`` and ``TEST_SEEDS`` are disjoint.  Frame: right-handed,
++Y up, centered, longest side 1, inside the sphere of radius 0.87 of the network's frame.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,7 @@ from reli3d.synthetic.assembly import ON_BACK, ON_SIDE, Assembly
 from reli3d.synthetic.finishes import draw_materials
 from reli3d.synthetic.materials import Material, evaluate
 
-TRAINING_SEEDS = range(0, 1_000_000_000)
-VALIDATION_SEEDS = range(1_000_000_000, 1_000_000_032)
+VALIDATION_SEEDS = range(1_000_000_000, 1_000_000_032)  # seeds of training objects are smaller
 TEST_SEEDS = range(1_000_000_032, 1_000_000_064)
 MAX_FACES = 30_000
 CREASE_DEG = 38.0  # facets of rounded edges meet at 30 degrees at most, faces of boxes at 90

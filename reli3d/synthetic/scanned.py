@@ -10,7 +10,7 @@ from torch import Tensor
 
 from reli3d._bridge import present
 from reli3d.geometry.distance import signed_distance
-from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.mesh import Mesh, joined
 from reli3d.geometry.rays import RayScene
 from reli3d.io.glb import read_glb
 from reli3d.render.gbuffer import surface_points
@@ -57,9 +57,8 @@ class ScannedSurface:
         size = float((high - low).max())
         self.gain = torch.ones(3) if rng is None else _factors(rng.normal(0, GAIN, 3) + rng.normal(0, GAIN))
         self.assets = [replace(a, mesh=_moved(a.mesh, (low + high) / 2, stretch, size)) for a in self.assets]
-        counts = np.cumsum([0] + [len(a.mesh.vertices) for a in self.assets])
-        self.vertices = torch.cat([a.mesh.vertices for a in self.assets])
-        self.faces = torch.cat([a.mesh.faces + int(n) for a, n in zip(self.assets, counts)])
+        whole = joined([a.mesh for a in self.assets])
+        self.vertices, self.faces = whole.vertices, whole.faces
         self.starts = torch.as_tensor(np.cumsum([0] + [len(a.mesh.faces) for a in self.assets]))
         self.scene = RayScene(self.vertices, self.faces)
 

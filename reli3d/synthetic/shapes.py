@@ -10,6 +10,7 @@ from scipy.sparse import coo_matrix
 from torch import Tensor
 
 from reli3d.errors import InputError
+from reli3d.geometry.mesh import joined
 from reli3d.io.glb import read_glb
 from reli3d.synthetic.finishes import draw_materials
 from reli3d.synthetic.procedural import CREASE_DEG, ProceduralObject, corner_normals, part_bounds, unit_size, yaw_matrix
@@ -41,14 +42,10 @@ def _count(rng: np.random.Generator) -> int:
 @lru_cache(64)
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Welded vertices, faces and the primitive of each face; longest side 1, centered."""
-    vertices, faces, owners, start = [], [], [], 0
-    for k, asset in enumerate(read_glb(path)):
-        vertices.append(asset.mesh.vertices.numpy())
-        faces.append(asset.mesh.faces.numpy() + start)
-        owners.append(np.full(len(faces[-1]), k))
-        start += len(vertices[-1])
-    v, f, part = np.concatenate(vertices).astype(np.float64), np.concatenate(faces), np.concatenate(owners)
-    v = unit_size(v)
+    meshes = [asset.mesh for asset in read_glb(path)]
+    whole = joined(meshes)
+    f, part = whole.faces.numpy(), np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
+    v = unit_size(whole.vertices.numpy().astype(np.float64))
     _, first, index = np.unique(np.round(v * 1e5).astype(np.int64), axis=0, return_index=True, return_inverse=True)
     f = index.reshape(-1)[f]
     keep = (f[:, 0] != f[:, 1]) & (f[:, 1] != f[:, 2]) & (f[:, 2] != f[:, 0])

@@ -1,7 +1,7 @@
 """Training examples of the small network: views, points and maps from :mod:`reli3d.synthetic.samples`, augmented."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ from safetensors import safe_open
 from torch import Tensor
 from torch.nn import functional
 
+from reli3d._bridge import mapped
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.symmetry import MirrorPlane
@@ -64,8 +65,7 @@ class TrainingViews:
     finish_known: Tensor  # (V,) bool: roughness and metallic are ground truth, not placeholders
 
     def of_views(self, chosen: slice | Tensor) -> "TrainingViews":
-        """The views of the indices ``chosen``."""
-        return TrainingViews(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
+        return mapped(self, lambda values: values[chosen])
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from pathlib import Path, PurePath
 import numpy as np
 
 from reli3d.errors import InputError, shown
-from reli3d.io.files import file_size
+from reli3d.io.files import file_size, opened
 from reli3d.views import colmap_binary
 from reli3d.views.file_names import FolderIndex, images_below, images_in
 from reli3d.views.frames import Frame, Lens, file_within, nearest_rigid, number
@@ -215,7 +215,7 @@ def _lines(path: Path):
     if size > MAX_BYTES:
         raise InputError(path, f"expected at most {MAX_BYTES} bytes, got {size}; export the model without points")
     try:
-        with open(path, encoding="utf-8-sig", errors="strict") as file:
+        with opened(path, "r", encoding="utf-8-sig", errors="strict") as file:
             for n, line in enumerate(iter(lambda: file.readline(MAX_LINE + 1), ""), 1):
                 if len(line) > MAX_LINE:
                     raise InputError(path, f"line {n}: expected at most {MAX_LINE} characters; export it again")
@@ -224,5 +224,3 @@ def _lines(path: Path):
                     yield n, line
     except UnicodeDecodeError:
         raise InputError(path, "expected UTF-8 text, got other bytes; export the model again") from None
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror or error}); check its permissions") from None

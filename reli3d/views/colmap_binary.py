@@ -7,9 +7,10 @@ skipped.
 import struct
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from reli3d.errors import InputError, shown
-from reli3d.io.files import file_size
+from reli3d.io.files import file_size, opened
 from reli3d.views.frames import MAX_PATH
 
 # in the order of their numbers; the pinhole cameras and those with a polynomial lens have so many parameters
@@ -32,7 +33,8 @@ _POINT = 24  # bytes: x, y, the number of the point
 
 def cameras(path: Path) -> Iterator[tuple[str, int, str, list[float], list[float]]]:
     """``(where, id, model, width and height, parameters)`` of each camera.  Raises InputError."""
-    with _Entries(path) as file:
+    with opened(path) as content:
+        file = _Entries(path, content)
         for where in file.each():
             key, model, width, height = file.take("<IiQQ")
             if not 0 <= model < len(_PARAMETERS):
@@ -43,7 +45,8 @@ def cameras(path: Path) -> Iterator[tuple[str, int, str, list[float], list[float
 
 def images(path: Path) -> Iterator[tuple[str, str, list[float], int]]:
     """``(name, where, rotation and translation, camera)`` of each image.  Raises InputError."""
-    with _Entries(path) as file:
+    with opened(path) as content:
+        file = _Entries(path, content)
         for where in file.each():
             _, *pose, camera = file.take("<I7dI")
             name = file.text(where)
@@ -62,18 +65,8 @@ def no_pinhole(where: str, name: str, known: Collection[str]) -> InputError:
 class _Entries:
     """A file that begins with the number of its entries; nothing is read beyond its end."""
 
-    def __init__(self, path: Path):
-        self.path, self.size, self.where = path, file_size(path), str(path)
-
-    def __enter__(self) -> "_Entries":
-        try:
-            self.file = open(self.path, "rb")  # noqa: SIM115 - closed by __exit__
-        except OSError as error:
-            raise InputError(self.path, f"cannot be read ({error.strerror or error}); check its permissions") from None
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.file.close()
+    def __init__(self, path: Path, file: BinaryIO):
+        self.path, self.file, self.size, self.where = path, file, file_size(path), str(path)
 
     def each(self) -> Iterator[str]:
         """Names of the entries for messages, as many as the file declares."""

@@ -45,7 +45,6 @@ def load_views(
     folder: str | os.PathLike,
     *,
     views: int | None = None,
-    first_views: int | None = None,
     masks: str | os.PathLike | None = None,
     every: bool = False,
     whole: bool = False,
@@ -54,21 +53,18 @@ def load_views(
     """Reads the images of an object folder with cameras and masks, in folder order.
 
     folder: with ``transforms.json`` (or its splits), a COLMAP model, ``cameras_sphere.npz`` or ``poses_bounds.npy``.
-    views: number of views, 1 to 16, by farthest-point sampling, the default above 16.  first_views: the first ones
-    instead.  every: all views; :meth:`Views.taken` selects later.  masks: folder; None: ``mask_path`` of a frame,
-    alpha, or a folder ``masks`` or ``mask``.  whole: downsample images above two megapixels instead of cropping to the
-    object.  remove_background: compute missing masks with ``rembg`` (extra ``masks``, downloads its network).
+    views: number of views, 1 to 16, by farthest-point sampling, the default above 16.  every: all views;
+    :meth:`Views.taken` selects later.  masks: folder; None: ``mask_path`` of a frame, alpha, or a folder ``masks`` or
+    ``mask``.  whole: downsample images above two megapixels instead of cropping to the object.  remove_background:
+    compute missing masks with ``rembg`` (extra ``masks``, downloads its network).
 
     Cameras far from the world origin are translated by ``-Views.origin``.  Raises InputError: file, field, value, fix.
 
     >>> views = reli3d.load_views("photos/shoe", views=4)
     >>> notes = views.notes
     """
-    for name, value in (("views", views), ("first_views", first_views)):
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_VIEWS):
-            raise InputError(name, f"expected 1 to {MAX_VIEWS}, got {value!r}; give a number in that range")
-    if views is not None and first_views is not None:
-        raise InputError("views", "expected views or first_views, got both; give one of them")
+    if views is not None and (isinstance(views, bool) or not isinstance(views, int) or not 1 <= views <= MAX_VIEWS):
+        raise InputError("views", f"expected 1 to {MAX_VIEWS}, got {views!r}; give a number in that range")
     root, is_folder = Path(folder), False
     with contextlib.suppress(OSError, ValueError):
         is_folder = root.is_dir()
@@ -88,7 +84,7 @@ def load_views(
     read: dict[int, tuple[Tensor, Tensor, list[float], list[str], bool]] = {}
     usable = list(range(len(frames)))  # for the choice: not those whose mask touches the border
     while True:
-        taken, choice = _chosen(frames, usable, views, first_views)
+        taken, choice = _chosen(frames, usable, views)
         kept = list(range(len(frames))) if every else taken
         missing = [i for i in kept if i not in read]
         # decoding releases the GIL; torch is not used there, as each of these threads would start threads of its own
@@ -96,7 +92,7 @@ def load_views(
             read |= zip(missing, pool.map(lambda i: _load(root, frames[i], files, whole, remover), missing))
         cut_off = [i for i in sorted(read) if touches_border(read[i][1])]
         others = [i for i in usable if i not in cut_off]
-        if first_views is not None or len(others) < LEAST_WHOLE or len(others) == len(usable):
+        if len(others) < LEAST_WHOLE or len(others) == len(usable):
             break
         usable = others
     frames, loaded = [frames[i] for i in kept], [read[i] for i in kept]
@@ -177,14 +173,10 @@ def _poses(frames: list[Frame], origin: tuple[float, float, float]) -> Tensor:
     return torch.from_numpy(poses.astype(np.float32))
 
 
-def _chosen(
-    frames: list[Frame], usable: list[int], views: int | None, first_views: int | None
-) -> tuple[list[int], list[str]]:
+def _chosen(frames: list[Frame], usable: list[int], views: int | None) -> tuple[list[int], list[str]]:
     """Indices of the frames for a network, of those in ``usable``, and notes on the choice and on how they lie."""
     poses, count, notes = torch.from_numpy(np.stack([frames[i].c2w for i in usable])), len(usable), []
-    if first_views is not None:
-        taken = list(range(min(first_views, count)))
-    elif views is not None or count > MAX_VIEWS:
+    if views is not None or count > MAX_VIEWS:
         taken = choose_views(poses, views or MAX_VIEWS, min_distance=0.0 if views else DUPLICATE_DISTANCE_RAD)
         if len(taken) < count:
             indices = ", ".join(str(usable[i]) for i in taken)

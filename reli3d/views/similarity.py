@@ -28,7 +28,6 @@ class Similarity:
 
     @staticmethod
     def identity() -> "Similarity":
-        """The identity transform."""
         return Similarity(
             1.0, torch.eye(3, dtype=torch.float64, device="cpu"), torch.zeros(3, dtype=torch.float64, device="cpu")
         )
@@ -52,7 +51,6 @@ class Similarity:
 
     @full_precision
     def inverse(self) -> "Similarity":
-        """The inverse transform."""
         return Similarity(1 / self.scale, self.rotation.T, -(self.rotation.T @ self.translation) / self.scale)
 
     def compose(self, first: "Similarity") -> "Similarity":

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from reli3d._bridge import check
+from reli3d._bridge import Movable, check
 from reli3d.geometry.camera import Camera
 from reli3d.views.similarity import Similarity
 
@@ -20,7 +20,7 @@ MASK_EDGE = 0.1  # alpha from which a pixel counts into the bounding box: keeps 
 
 
 @dataclass(frozen=True)
-class ViewBatch:
+class ViewBatch(Movable):
     """Views resampled to one size: ``images (V, S, S, 3)``, ``masks (V, S, S)``, their cameras and names."""
 
     images: Tensor
@@ -37,14 +37,9 @@ class ViewBatch:
         """The cameras of all views."""
         return Camera(self.c2w, self.intrinsics, *self.images.shape[2:0:-1])
 
-    def to(self, device: torch.device | str) -> "ViewBatch":
-        """The same batch with its tensors on ``device``."""
-        images, masks, c2w, intrinsics = (t.to(device) for t in (self.images, self.masks, self.c2w, self.intrinsics))
-        return ViewBatch(images, masks, c2w, intrinsics, self.names)
-
 
 @dataclass(frozen=True)
-class Views:
+class Views(Movable):
     """``V`` posed images, which may have different sizes; view 0 is the reference view of the published network.
 
     images: V tensors ``(H, W, 3)``, float32 sRGB in [0, 1].  masks: V tensors ``(H, W)``, float32 alpha in [0, 1].
@@ -121,11 +116,6 @@ class Views:
         ``object_box`` is dropped because it is axis-aligned in the old frame.
         """
         return replace(self, c2w=similarity.of_cameras(self.c2w), object_box=None)
-
-    def to(self, device: torch.device | str) -> "Views":
-        """The same views with their tensors on ``device``."""
-        images, masks = (tuple(t.to(device) for t in group) for group in (self.images, self.masks))
-        return replace(self, images=images, masks=masks, c2w=self.c2w.to(device), intrinsics=self.intrinsics.to(device))
 
     def resampled(self, size: int, *, crop: bool = True, padding: float = 0.08) -> ViewBatch:
         """All views at ``size`` x ``size`` pixels, with the intrinsics of the new pixels.

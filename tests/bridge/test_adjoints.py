@@ -22,6 +22,7 @@ from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.material import sample_bsdf
 from reli3d.render.sampling import pdf_ggx_vndf
+from tests.support import lobes as lobe_kernels
 from tests.support import op_cases, reference, reference_surface
 from tests.support.meshes import sheet
 from tests.support.reference import grid_samples
@@ -247,7 +248,7 @@ def irradiance(g) -> Op:
     leaves = {"normals": op_cases.units(6000, 2), **lobes(g, 24)}
     return Op(
         leaves,
-        lambda normals, *light: SphericalGaussians(*light).irradiance(normals),
+        lambda normals, *light: lobe_kernels.irradiance(SphericalGaussians(*light), normals),
         reference.sg_irradiance,
         ("normals", "axis"),
         one_sign=True,

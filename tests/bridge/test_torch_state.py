@@ -107,11 +107,11 @@ def asset() -> reli3d.Asset:
 
 def reconstructed():
     options = reli3d.ReconstructOptions(resolution=16, texture_size=256)
-    return reli3d.reconstruct(reli3d.load_views(EXAMPLE, first_views=2), options=options)
+    return reli3d.reconstruct(reli3d.load_views(EXAMPLE).select(2), options=options)
 
 
 def refined():
-    return reli3d.refine(asset(), reli3d.load_views(EXAMPLE, first_views=2), steps=1, resolution=32)
+    return reli3d.refine(asset(), reli3d.load_views(EXAMPLE).select(2), steps=1, resolution=32)
 
 
 def glb(folder):
@@ -151,7 +151,6 @@ def meshes():
     return (
         report,
         mesh.largest_components(shape),
-        mesh.volume(shape),
         mesh.watertight(shape),
         reli3d.unwrap(shape, texture_size=64).with_tangents().tangents,
     )

@@ -1,11 +1,11 @@
-"""``reli3d-render``, ``-data``, ``-train`` and ``-eval`` on invalid input: one line, exit code 2, before any work."""
+"""Invalid input of ``reli3d-infer``, ``-render``, ``-data``, ``-train``, ``-eval``: one line, exit code 2, no work."""
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
-from reli3d.cli import data, render, train
+from reli3d.cli import data, infer, render, train
 from reli3d.cli import eval as evaluation
 from reli3d.errors import InputError
 from reli3d.synthetic.stored import OPTIONAL, TENSORS, check_sample
@@ -78,6 +78,31 @@ CASES = [
             (["--output", "turn.mov"], "expected a folder or a file of type .png"),
             (["--output", "turn.png", "--frames", "4"], "--frames: expected 1 where --output names one png, got 4"),
             ([], "not found"),
+            (["--size", "0"], "--size"),
+            (["--elevation", "90"], "--elevation"),
+            (["--azimuth", "nan"], "--azimuth"),
+            (["--exposure", "nan"], "--exposure"),
+            (["--distance", "inf"], "--distance"),
+            (["--diffuse-model", "white"], "arguments: "),
+            (["--output", "a.gif", "--format", "png"], "--format: expected gif"),
+            (["--output", "a.mp4", "--size", "47"], "--size: expected an even number"),
+        ]
+    ),
+    *(
+        (infer, [str(infer.EXAMPLE), "--output", "out", *options], word)
+        for options, word in [
+            (["--texture-size", "100"], "--texture-size"),
+            (["--resolution", "4"], "--resolution"),
+            (["--views", "0"], "--views"),
+            (["--weights", "nowhere.safetensors"], "nowhere.safetensors"),
+            (["--refine", "-1"], "--refine"),
+            (["--refine", "0steps"], "--refine"),
+            (["--refine", "soon"], "--refine"),
+            (["--refine-cameras"], "--refine-cameras"),
+            (["--light", "camera"], "add --refine"),
+            (["--no-such-option"], "arguments: "),
+            (["--device", "abacus"], "arguments: "),
+            (["--views", "many"], "arguments: "),
         ]
     ),
     *(
@@ -98,6 +123,10 @@ CASES = [
             (["maps.npz", "--views", "0"], "--views"),
             (["maps.npz", "--size", "0"], "--size"),
             (["maps.npz", "--meshes", "none.glb"], "not found"),
+            (["maps.npz", "--meshes", "empty"], "expected GLB files"),
+            (["maps.npz", "--protocol", "paper", "--views", "8"], "--views: expected none"),
+            (["maps.npz", "--protocol", "paper", "--held-out", "test"], "expected at least 3 for --protocol paper"),
+            (["maps.npz", "--workers", "2", "--ray", "auto"], "not allowed with"),
         ]
     ),
     (data, ["render", "file", "--maps", "maps.npz"], "a file"),
@@ -117,6 +146,9 @@ CASES = [
             (["light_prior", "--patch", "8"], "--patch"),
             (["volume", "--patch", "999"], "patch"),
             (["pixels", "--image-size", "32"], "--image-size"),
+            (["small", "--image-size", "8"], "--image-size: expected none for stage small"),
+            (["small", "--lobes", "8"], "--lobes: expected none for stage small"),
+            (["volume", "--points", "8"], "--points: expected none for stage volume"),
         ]
     ),
     *(
@@ -188,8 +220,10 @@ def test_a_device_is_cpu_or_cuda(device, capsys):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_cuda_that_is_missing_is_reported(capsys):
-    assert render.main(["x.glb", "--device", "cuda"]) == 2
+@pytest.mark.parametrize("command, path", [(render, "x.glb"), (infer, infer.EXAMPLE)])
+def test_cuda_that_is_missing_is_reported(command, path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert command.main([str(path), "--device", "cuda"]) == 2
     assert "expected a CUDA device" in capsys.readouterr().err
 
 

@@ -114,29 +114,6 @@ def test_one_bad_object_leaves_the_others_bitwise_equal(example, tmp_path, capsy
     assert (tmp_path / "out/example/mesh.glb").stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [["--texture-size", "100"], ["--resolution", "4"], ["--views", "0"], ["--weights", "nowhere.safetensors"]],
-)
-def test_options_out_of_range_end_with_2(tmp_path, capsys, arguments):
-    assert infer.main([str(infer.EXAMPLE), "--output", str(tmp_path / "out"), *arguments]) == 2
-    assert capsys.readouterr().err.count("reli3d-infer: ") == 1
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_cuda_is_not_replaced_by_the_cpu(tmp_path, capsys):
-    assert infer.main(["--device", "cuda", "--output", str(tmp_path / "out")]) == 2
-    assert "expected a CUDA device" in capsys.readouterr().err
-
-
-def test_check_explains_the_example_and_draws_the_rig(tmp_path, capsys):
-    assert check.main(["--output", str(tmp_path)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len(load_views(infer.EXAMPLE)) == 12 and any("agree" in line for line in lines)
-    assert (tmp_path / "example" / "rig.png").stat().st_size > 10_000
-
-
 def test_wrong_cameras_end_the_check_with_3_and_are_named_where_the_reconstruction_fails(tmp_path, capsys):
     folder = moved_example(tmp_path / "object", torch.eye(4, dtype=torch.float64))
     data = json.loads((folder / "transforms.json").read_text())
@@ -163,7 +140,7 @@ def test_json_is_one_object_on_stdout(tmp_path, capsys):
     assert seen["exit_code"] == 1 and [o["object"] for o in seen["objects"]] == ["example", "empty"]
     example, empty = seen["objects"]
     assert example["result"] == "done" and not example["suspect"] and example["verdict"].startswith("cameras agree")
-    assert len(example["lines"]) == 12 and Path(example["image"]).is_file()
+    assert len(example["lines"]) == 12 and Path(example["image"]).stat().st_size > 10_000
     assert empty["result"] == "refused" and "expected transforms.json" in empty["notes"][0]
     assert command(tmp_path, *folders, "--json", "--views", "2") == 1
     made = json.loads(capsys.readouterr().out)["objects"]
@@ -188,15 +165,3 @@ def test_refinement_writes_refine_png_and_its_loss_curve(tmp_path):
     page = (folder / "viewer.html").read_text()
     names = re.findall(r'"name": "(mesh|before|after)"', page)
     assert names == (["after", "before"] if any(record["kept"].values()) else ["mesh"])
-
-
-def test_a_refinement_of_no_time_is_refused(tmp_path, capsys):
-    for options in (
-        ["--refine", "-1"],
-        ["--refine", "0steps"],
-        ["--refine", "soon"],
-        ["--refine-cameras"],
-        ["--light", "camera"],
-    ):
-        assert command(tmp_path, *options) == 2
-        assert "refine" in capsys.readouterr().err and not (tmp_path / "out").exists()

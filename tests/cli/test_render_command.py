@@ -155,25 +155,16 @@ def test_turntables_are_their_frames(scene, turn, monkeypatch):
             assert errors[k] < 0.03 and errors[k] == min(errors), errors  # WebP loses detail
 
 
-def test_diffuse_model_and_wrong_options(scene, capsys):
+def test_diffuse_model_and_a_missing_light(scene, capsys):
     image = pixels(run(scene, light=None)["ball.png"])
     published = pixels(run(scene, "--diffuse-model", "published", light=None)["ball.png"])
     changed = published[..., :3].int() - image[..., :3].int()
     assert int(changed.max()) > 3 and int(changed.min()) >= -1  # more light at the rim, the same noise
-    common = [str(scene / "ball.glb"), "--output", str(scene / "none")]
-    assert main([*common, "--diffuse-model", "white"]) == 2
     capsys.readouterr()
-    for wrong in (
-        ["--size", "0"],
-        ["--elevation", "90"],
-        ["--azimuth", "nan"],
-        ["--exposure", "nan"],
-        ["--distance", "inf"],
-        ["--light", str(scene / "none.hdr")],
-    ):
-        assert main([*common, *wrong]) == 2
-        output = capsys.readouterr()
-        assert output.err.startswith("reli3d-render: ") and output.err.count("\n") == 1 and output.out == ""
+    light = str(scene / "none.hdr")
+    assert main([str(scene / "ball.glb"), "--output", str(scene / "none"), "--light", light]) == 2
+    output = capsys.readouterr()
+    assert output.err.startswith("reli3d-render: ") and output.err.count("\n") == 1 and output.out == ""
     assert not (scene / "none").exists()
 
 
@@ -216,15 +207,3 @@ def test_the_name_of_the_output_makes_one_image(scene, tmp_path, name):
     assert found.read_bytes() == next(iter(in_folder.values())).read_bytes()
     layers = run(scene, "--output", str(tmp_path / name), "--aovs")
     assert f"{found.stem}_normal.exr" in layers and len(layers) == 5
-
-
-@pytest.mark.parametrize(
-    "words, text",
-    [
-        (["--output", "a.gif", "--format", "png"], "--format: expected gif"),
-        (["--output", "a.mp4", "--size", "47"], "--size: expected an even number"),
-    ],
-)
-def test_an_animation_that_cannot_be_is_refused(scene, capsys, words, text):
-    assert main([str(scene / "ball.glb"), *words]) == 2
-    assert text in capsys.readouterr().err

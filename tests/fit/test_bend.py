@@ -12,8 +12,9 @@ from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights
 from reli3d.fit.maps import FixedSurface
 from reli3d.fit.transfer import changed
-from reli3d.fit.unknowns import MAX_BEND, Start, Unknowns, bent
-from reli3d.geometry.bake import interpolate, rasterize_texels
+from reli3d.fit.unknowns import MAX_BEND, Start, Unknowns, bent, unit
+from reli3d.geometry.bake import rasterize_texels
+from reli3d.geometry.hits import interpolate
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from tests.support import small_scene
@@ -87,11 +88,10 @@ def test_the_bend_is_written_into_the_normal_map(start):
     unknowns.bend[0] += torch.tensor([0.3, 0.0, 0.0])
     asset = changed(start, unknowns)
     found = rasterize_texels(asset.mesh, small_scene.TEXELS)
-    index = torch.nonzero(found.valid.reshape(-1))[:, 0]
-    position, plain = interpolate(start.mesh, found, index)
-    got = surface_points(
-        asset.mesh, asset.textures, found.face.reshape(-1)[index], found.bary.reshape(-1, 2)[index]
-    ).normal
+    face, bary = found.face[found.valid], found.bary[found.valid]
+    position = interpolate(start.mesh.vertices, start.mesh.faces, face, bary)
+    plain = unit(interpolate(start.mesh.normals, start.mesh.faces, face, bary))
+    got = surface_points(asset.mesh, asset.textures, face, bary).normal
     length = 0.3 / math.sqrt(1.0 + (0.3 / MAX_BEND) ** 2)
     expected = torch.nn.functional.normalize(plain + torch.tensor([length, 0.0, 0.0]), dim=-1)
     assert torch.allclose(bent(unknowns, position, plain)[0], expected, atol=1e-6)

@@ -11,16 +11,17 @@ from PIL import Image
 from scipy import ndimage
 
 from bench.surface import field
-from reli3d.geometry.bake import bake, dilate, interpolate, nearest_valid, rasterize_texels
+from reli3d.geometry.bake import bake, nearest_valid, rasterize_texels
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.surface import extract_surface
-from reli3d.geometry.tangents import decode_normals, encode_normals
+from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import unwrap
-from reli3d.io.glb import encode_image, write_glb
+from reli3d.io.glb import write_glb
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import srgb_to_linear
 from tests.support import gltf
 from tests.support.meshes import QUICK, SLOW, loaded, mesh_from
+from tests.support.reference import decode_normals
 from tests.support.texels import bilinear, color
 
 SIZE = 256
@@ -97,7 +98,8 @@ def test_positions_and_normals_interpolate_linearly(sphere, device):
     mesh = sphere.to(device)
     texels = rasterize_texels(mesh, SIZE)
     index = torch.nonzero(texels.valid.reshape(-1)).reshape(-1)
-    position, normal = interpolate(mesh, texels, index)
+    both = bake(mesh, SIZE, lambda p, n: torch.cat([p, n], 1), texels=texels)["value"]
+    position, normal = both.reshape(-1, 6)[index].split(3, 1)
     face = mesh.faces.long()[texels.face.reshape(-1)[index].long()]
     b = texels.bary.reshape(-1, 2)[index].double()
     w = torch.stack([1 - b.sum(1), b[:, 0], b[:, 1]], 1)[..., None]
@@ -154,7 +156,9 @@ def test_chunks_and_reused_texels_do_not_matter(sphere):
     other = bake(sphere, SIZE, lambda p, n: {"a": color(p), "b": n[:, :1]}, chunk=777, texels=texels)
     assert all(torch.equal(one[k], other[k]) for k in "ab") and one["b"].shape == (SIZE, SIZE, 1)
     bare = bake(sphere, SIZE, lambda p, n: color(p), texels=texels, fill=False)["value"]
-    assert torch.equal(dilate(bare, texels.valid), one["a"]) and float(bare[~texels.valid].abs().max()) == 0.0
+    nearest = nearest_valid(texels.valid)[0].reshape(-1).long()
+    assert torch.equal(bare.reshape(-1, 3)[nearest], one["a"].reshape(-1, 3))
+    assert float(bare[~texels.valid].abs().max()) == 0.0
 
 
 def test_numbers_of_the_vertices_reach_the_texels(sphere):
@@ -179,15 +183,9 @@ def test_nearest_valid_is_exact(device, shape, fraction):
     assert torch.equal(((source // shape[1] - y) ** 2 + (source % shape[1] - x) ** 2).float(), square)
 
 
-def test_dilation_limits_and_empty_masks(device):
-    valid = torch.zeros(9, 9, dtype=torch.bool, device=device)
-    image = torch.zeros(9, 9, 2, device=device)
-    assert torch.equal(dilate(image, valid), image)
-    valid[4, 4], image[4, 4] = True, torch.tensor([1.0, 2.0], device=device)
-    near = dilate(image, valid, iterations=2)[..., 0]
-    y, x = torch.meshgrid(torch.arange(9), torch.arange(9), indexing="ij")
-    assert torch.equal(near.cpu() > 0, (y - 4) ** 2 + (x - 4) ** 2 <= 4)
-    assert float(dilate({"m": image}, valid)["m"][..., 1].min()) == 2.0
+def test_without_a_valid_texel_there_is_no_nearest_one(device):
+    source, square = nearest_valid(torch.zeros(9, 9, dtype=torch.bool, device=device))
+    assert bool((source == -1).all()) and bool((square == math.inf).all())
 
 
 def test_faults_are_named(sphere):
@@ -204,8 +202,6 @@ def test_faults_are_named(sphere):
         bake(sphere, 16, lambda p, n: {next(names): p}, chunk=64)
     with pytest.raises(ValueError, match="chunk"):
         bake(sphere, 16, lambda p, n: p, chunk=0)
-    with pytest.raises(ValueError, match=r"maps: expected shape \(4, 4, 'C'\)"):
-        dilate(torch.zeros(5, 4, 1), torch.zeros(4, 4, dtype=torch.bool))
     with pytest.raises(ValueError, match="mesh.normals"):
         Mesh(sphere.vertices, sphere.faces, uv=sphere.uv).with_tangents()
 
@@ -399,10 +395,3 @@ def test_known_color_reads_back_from_the_file_of_an_extracted_surface(tmp_path, 
     size = 1024 if n > 24 else 512
     write_glb(tmp_path / "a.glb", baked(mesh, size))
     assert check_file(tmp_path / "a.glb", mesh) < 0.5 * STEP  # smooth charts: 8 bit alone is a quarter of a step
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (33, 64)])
-def test_png_is_exact(shape):
-    pixels = torch.randint(0, 256, (*shape, 3), generator=torch.Generator().manual_seed(1))
-    stored = np.asarray(Image.open(io.BytesIO(encode_image(pixels / 255.0))))
-    assert np.array_equal(stored, pixels.numpy())

@@ -7,8 +7,8 @@ import torch
 import trimesh
 
 from reli3d.geometry.decimate import decimate
-from reli3d.geometry.mesh import Mesh, report, volume
-from tests.support.meshes import mesh_from
+from reli3d.geometry.mesh import Mesh, report
+from tests.support.meshes import mesh_from, volume
 
 BOX = mesh_from(trimesh.creation.box((2.0, 1.0, 1.0)))
 BALL = mesh_from(trimesh.creation.icosphere(subdivisions=3))
@@ -24,7 +24,7 @@ def test_decimation_reaches_its_target_and_keeps_the_shape(target):
         r = report(got)
         assert r.watertight and r.euler == 2
         # a polyhedron of n faces with corners near the unit sphere loses about 8 / n of its volume
-        assert abs(float(volume(got)) / scale**3 / float(volume(ball)) - 1) < 10 / target
+        assert abs(volume(got) / scale**3 / volume(ball) - 1) < 10 / target
 
 
 def test_decimation_of_flat_faces_is_exact():
@@ -33,7 +33,7 @@ def test_decimation_of_flat_faces_is_exact():
     for _ in range(3):
         box = box.subdivide()
     got = decimate(mesh_from(box), 60)
-    assert float(volume(got)) == pytest.approx(2.0, rel=1e-5)
+    assert volume(got) == pytest.approx(2.0, rel=1e-5)
 
 
 def test_decimation_is_deterministic_and_leaves_small_meshes_alone():

@@ -8,7 +8,7 @@ from reli3d.cli import infer
 from reli3d.geometry import mesh as meshes
 from reli3d.geometry.bake import bake, rasterize_texels
 from reli3d.geometry.decimate import decimate
-from reli3d.geometry.mesh import Mesh, report, vertex_normals, volume
+from reli3d.geometry.mesh import Mesh, report, vertex_normals
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import CubeWeights, extract_surface, surface_cubes
@@ -16,6 +16,7 @@ from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.io.glb import glb_bytes
 from reli3d.nn.weights import load, locate, save
 from reli3d.render.asset import Asset, TextureSet
+from tests.support.meshes import volume
 from tests.support.reference_surface import random_weights
 
 SHAPE = (5, 6, 7)
@@ -49,9 +50,9 @@ def test_a_full_field_is_the_box_with_its_edges_cut_off(device):
     sdf = -torch.ones(SHAPE, device=device)
     mesh = extract_surface(sdf, radius=(1.0, 1.5, 2.0))
     found = report(mesh)
-    assert found.watertight and found.manifold and found.euler == 2 and float(volume(mesh)) > 0
+    assert found.watertight and found.manifold and found.euler == 2 and volume(mesh) > 0
     hull = trimesh.Trimesh(mesh.vertices.cpu().numpy()).convex_hull
-    assert float(volume(mesh)) == pytest.approx(hull.volume, rel=1e-5)
+    assert volume(mesh) == pytest.approx(hull.volume, rel=1e-5)
     assert mesh.vertices.abs().amax(0).tolist() == [1.0, 1.5, 2.0]
     leaf = sdf.requires_grad_()
     for center in (False, True):  # a crossing between a vertex and its copy in the padding does not move
@@ -66,7 +67,7 @@ def test_mesh_operations_accept_no_faces():
         n = len(mesh.vertices)
         found = report(mesh)
         assert (found.vertices, found.faces, found.components, found.watertight) == (n, 0, 0, False)
-        assert not meshes.watertight(mesh) and float(volume(mesh)) == 0.0
+        assert not meshes.watertight(mesh) and volume(mesh) == 0.0
         assert vertex_normals(mesh.vertices, mesh.faces).tolist() == [[0.0, 0.0, 1.0]] * n
         assert meshes.face_normals(mesh.vertices, mesh.faces).shape == (0, 3)
         assert len(mesh.with_normals().normals) == n

@@ -7,17 +7,18 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from reli3d.geometry.bake import Texels, interpolate, interpolate_tangents
+from reli3d.geometry.bake import Texels, bake
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import hull_distance
 from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.regularize import vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import CubeWeights, extract_surface
-from reli3d.geometry.tangents import decode_normals, encode_normals
+from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.kernels.flexicubes import SDF_MIN
 from tests.support import reference_surface
+from tests.support.reference import decode_normals
 
 N = 100_000
 CUBES = 47  # a side: 103,823 cubes
@@ -251,9 +252,8 @@ def test_interpolation_of_texels(device):
     bary[::3] = corner[torch.arange(len(bary[::3])) % 5]
     face = torch.arange(size * size, dtype=torch.int32)
     texels = Texels(face.view(size, size).to(device), bary.view(size, size, 2).to(device), (face >= 0).view(size, size))
-    index = torch.arange(size * size, device=device)
-    position, normal = interpolate(mesh, texels, index)
-    along = interpolate_tangents(mesh, texels, index)
+    values = bake(mesh, size, lambda *at: torch.cat(at, 1), texels=texels, tangents=True)["value"]
+    position, normal, along = values.view(-1, 10).split([3, 3, 4], 1)
     assert finite(position, normal, along)
     ones = torch.ones(size * size)
     torch.testing.assert_close(normal.norm(dim=1).cpu(), ones, rtol=0, atol=1e-6)

@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from reli3d import pipeline
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import hull_distance, hull_grid, hull_span, mask_distance, mirror_residual
-from reli3d.nn.field import bound_sdf
 from reli3d.nn.local import LocalField
 from reli3d.nn.presets import SMALL
 from reli3d.nn.view_features import ViewMaps
@@ -276,8 +275,9 @@ def test_the_reach_is_that_of_the_points_inside(device, radius, views):
     images = torch.cat([torch.zeros(*masks.shape, 3, device=device), mask_distance(masks)[..., None]], -1)
     maps = ViewMaps(images.new_empty(views, 1, 1, 1), images, camera)
     model = SimpleNamespace(preset=SMALL)
-    grid = pipeline._grid(80, SMALL.radius, device).reshape(-1, 3)
-    dense = float(grid[bound_sdf(maps, grid, SMALL.softness) < 0].abs().max())
+    axis = torch.linspace(-SMALL.radius, SMALL.radius, 81, device=device)
+    grid = torch.cartesian_prod(axis, axis, axis)
+    dense = float(grid[hull_distance(grid, maps.silhouette, maps.camera) > 0].abs().max())
     assert pipeline._hull_reach(LocalField(maps, model, None, None, None, None, None), 80) == dense
     empty = replace(maps, images=images - 1000.0)
     with pytest.raises(ValueError, match="masks: expected masks that overlap"):

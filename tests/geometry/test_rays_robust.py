@@ -13,11 +13,10 @@ import torch
 import trimesh
 
 from reli3d.geometry.hits import hit_normals, interpolate
-from reli3d.geometry.rays import offset_origin
 from reli3d.render.environment import Environment
 from reli3d.render.shading import shade
 from tests.support.checkout import ROOT
-from tests.support.rays import BACKENDS, PLACES, bumpy, make, placed, rays, soup
+from tests.support.rays import BACKENDS, PLACES, bumpy, make, offset_origin, placed, rays, soup
 from tests.support.scenes import sky
 from tests.support.surfaces import at
 
@@ -224,7 +223,7 @@ def test_no_light_comes_into_a_closed_box_nor_through_a_gap_of_1e_5(device, back
         position = interpolate(scene.vertices, scene.faces, face, w[:, 1:].contiguous())
         ng = hit_normals(scene.vertices, scene.faces, face)
         inward = torch.where((d * ng).sum(-1, keepdim=True) > 0.0, -d, d)
-        o = offset_origin(position, ng, inward, scale=scene.scale)
+        o = offset_origin(position, ng, inward, scene.scale)
         within = (position + 1e-3 * inward).abs().amax(-1) < 1.0  # not along the other wall of an edge
         leaks = ~scene.occluded(o, inward) & within
         assert float(leaks.sum()) <= limit * float(within.sum()), (place, int(leaks.sum()))
@@ -235,7 +234,7 @@ def test_no_light_comes_into_a_closed_box_nor_through_a_gap_of_1e_5(device, back
     up = d * torch.sign(d[:, 2:])
     up = up[up[:, 2] > 0.1]
     o, ng = o[: len(up)], torch.tensor([0.0, 0, 1], device=device).expand(len(up), 3)
-    assert bool(scene.occluded(offset_origin(o, ng, up, scale=scene.scale), up).all())
+    assert bool(scene.occluded(offset_origin(o, ng, up, scene.scale), up).all())
 
 
 @pytest.mark.parametrize("count", [500, 10_000])  # Embree's are ordered where they are many

@@ -6,9 +6,10 @@ import pytest
 import torch
 import trimesh
 
-from reli3d.geometry.mesh import Mesh, volume
+from reli3d.geometry import smooth
+from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.smooth import taubin_smooth
-from tests.support.meshes import mesh_from, sheet
+from tests.support.meshes import mesh_from, sheet, volume
 
 
 def ball(device="cpu", subdivisions=3, noise=0.0):
@@ -17,7 +18,8 @@ def ball(device="cpu", subdivisions=3, noise=0.0):
     return Mesh(mesh.vertices * (1 + noise * torch.randn(len(mesh.vertices), 1, generator=rng).to(device)), mesh.faces)
 
 
-def test_a_wave_on_a_closed_strip_is_scaled_by_its_eigenvalue():
+def test_a_wave_on_a_closed_strip_is_scaled_by_its_eigenvalue(monkeypatch):
+    monkeypatch.setattr(smooth, "STEP", 1.0)
     n = 24  # a prism of three rings: every vertex sees the same neighbors, so cos(k phi) is an eigenvector
     phi = 2 * math.pi * torch.arange(n) / n
     rings = torch.stack([torch.stack([torch.zeros(n), torch.zeros(n), torch.cos(3 * phi)], -1)] * 3)
@@ -31,21 +33,21 @@ def test_a_wave_on_a_closed_strip_is_scaled_by_its_eigenvalue():
     mesh = Mesh(at.view(-1, 3), torch.cat(faces).to(torch.int32))
     # six neighbors: two along the ring, one opposite and one a step on in each neighbor ring
     eigenvalue = (2 + 4 * math.cos(3 * 2 * math.pi / n)) / 6 - 1
-    got = taubin_smooth(mesh, iterations=1, step=1.0, pass_band=0.1).vertices.view(3, n, 3)[..., 2]
+    got = taubin_smooth(mesh, iterations=1).vertices.view(3, n, 3)[..., 2]
     mean = got.mean(0) @ torch.cos(3 * phi) / (n / 2)
     assert float(mean) == pytest.approx((1 + eigenvalue) * (1 + eigenvalue / (0.1 - 1)), abs=1e-5)
 
 
 def test_noise_is_removed_and_the_volume_kept(device):
     clean, noisy = ball(device), ball(device, noise=0.03)
-    smooth = taubin_smooth(noisy, iterations=20)
+    got = taubin_smooth(noisy, iterations=20)
 
     def spread(mesh):
         return float(mesh.vertices.norm(dim=-1).std())
 
-    assert spread(smooth) < 0.4 * spread(noisy)
+    assert spread(got) < 0.4 * spread(noisy)
     # the pass band lifts a frequency by at most 0.975 * 1.0263 - 1 = 6.6e-4 a pair, which is 4 % of volume after 20
-    assert abs(float(volume(smooth) / volume(clean)) - 1) < 0.04
+    assert abs(volume(got) / volume(clean) - 1) < 0.04
 
 
 def test_borders_stay():
@@ -69,12 +71,9 @@ def test_copies_of_a_vertex_move_together_and_uv_stay():
     torch.testing.assert_close(got.vertices, expected.vertices[whole.faces.long().view(-1)], rtol=0, atol=2e-6)
 
 
-@pytest.mark.parametrize(
-    "change", [dict(iterations=-1), dict(step=0.0), dict(step=1.5), dict(pass_band=0.0), dict(pass_band=2.0)]
-)
-def test_wrong_input_is_named(change):
-    with pytest.raises(ValueError, match=f"^{next(iter(change))}: expected"):
-        taubin_smooth(ball(subdivisions=1), **change)
+def test_wrong_input_is_named():
+    with pytest.raises(ValueError, match="^iterations: expected"):
+        taubin_smooth(ball(subdivisions=1), iterations=-1)
 
 
 def test_nothing_to_do_changes_nothing():

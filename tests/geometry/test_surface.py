@@ -7,12 +7,13 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from bench.peers.flexicubes_torch import cube_list, flexicubes
-from reli3d.geometry.mesh import face_components, report, vertex_normals, volume
+from reli3d.geometry.mesh import face_components, report, vertex_normals
 from reli3d.geometry.regularize import vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import CubeWeights, extract_surface, surface_cubes
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.geometry.uv import unwrap
+from tests.support.meshes import volume
 from tests.support.reference_surface import grid, random_weights, sphere, torus
 
 F = torch.nn.functional
@@ -105,7 +106,7 @@ def test_one_inside_vertex_has_the_eight_dual_vertices_of_the_closed_form(device
     got = mesh.vertices.cpu()
     order = torch.from_numpy(np.lexsort(got.sign().numpy().T[::-1]))
     torch.testing.assert_close(got[order], sign, rtol=0, atol=1e-7)  # float32 of 0.0667
-    assert float(volume(mesh)) == pytest.approx((2 * 0.8 / 12) ** 3, rel=1e-5)  # a cube of that half side
+    assert volume(mesh) == pytest.approx((2 * 0.8 / 12) ** 3, rel=1e-5)  # a cube of that half side
 
 
 @pytest.mark.parametrize("case", range(1, 255, 11))
@@ -114,7 +115,7 @@ def test_one_cube_is_closed_at_the_box(device, case):
     mesh = extract_surface(sdf, radius=1.0, weights=CubeWeights(**random_weights(sdf.shape, case, device)))
     found = report(mesh)
     assert found.watertight and found.manifold, found
-    assert float(volume(mesh)) > 0
+    assert volume(mesh) > 0
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -131,7 +132,7 @@ def test_noise_is_a_closed_manifold_with_the_inside_on_the_inner_side(device, se
     # without weights a quad's normal has a positive product with the step from its inside to its outside end
     plain = extract_surface(sdf, radius=(0.5, 1.0, 2.0))
     inside_volume = (sdf < 0).float().mean()
-    assert 0.3 < float(volume(plain)) / (8 * 0.5 * 1.0 * 2.0) / float(inside_volume) < 1.7
+    assert 0.3 < volume(plain) / (8 * 0.5 * 1.0 * 2.0) / float(inside_volume) < 1.7
 
 
 def test_a_half_space_is_closed_flat_at_the_box(device):
@@ -142,7 +143,7 @@ def test_a_half_space_is_closed_flat_at_the_box(device):
     assert closed.vertices.abs().max() == 1.5
     # box of 3 x 1.575 x 3 but for the chamfered edges, half a cube of 0.25 on each side: under 3 % of the volume
     exact = 3.0 * 3.0 * 1.5 * 1.05
-    assert 0.97 * exact < float(volume(closed)) <= exact * (1 + 1e-6)
+    assert 0.97 * exact < volume(closed) <= exact * (1 + 1e-6)
     opened = report(extract_surface(sdf, radius=1.5, closed=False))
     assert opened.boundary_edges > 0
     away = sphere(12, device=device)

@@ -8,7 +8,7 @@ import torch
 from reli3d.nn.heads import HEADS, deformation, truncated_exp
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import OFFICIAL
-from reli3d.nn.reni import to_published
+from reli3d.render.latlong import quarter_turn
 from tests.support.networks import NANO, golden_tiny, views
 
 
@@ -40,7 +40,7 @@ def test_tiny_system_matches_published_end_to_end(tiny):
     close(code.rotation, g["rotation"])
     environment = model.decode_environment(code)
     assert environment.shape == (1, 64, 128, 3)
-    published = to_published(environment[0])[None]
+    published = quarter_turn(environment[0], 1)[None]
     torch.testing.assert_close(published[:, ::2, ::2], g["env_map"], rtol=1e-4, atol=1e-6)
 
 

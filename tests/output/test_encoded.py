@@ -32,15 +32,16 @@ def views():
     return Views((torch.ones(8, 8, 3),), (torch.ones(8, 8),), c2w, torch.tensor([[9.0, 9.0, 4.0, 4.0]]), ("a.png",))
 
 
-def written(folder, encoded):
+def written(folder, asset, views, **options):
     with results.claim(folder) as replacing:
-        results.write_results(replacing, encoded, PREVIEW, {**RECORD, "object": "ball"})
+        files = results.encode(asset, views, RECORD, name="ball", **options)
+        results.write_results(replacing, asset, *files, PREVIEW, {**RECORD, "object": "ball"})
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_the_mesh_is_moved_and_the_page_shows_it_in_place(tmp_path, asset, views, threads, count):
     threads(count)
-    written(tmp_path / "ball", results.encode(asset, views, RECORD, name="ball", translation=MOVED))
+    written(tmp_path / "ball", asset, views, translation=MOVED)
     extras = {k: RECORD[k] for k in ("output_from_input", "model_from_input", "weights")}
     assert (tmp_path / "ball" / "mesh.glb").read_bytes() == glb_bytes(asset, extras=extras, translation=MOVED)
     (shown,) = re.findall(r'"glb": "([^"]*)"', (tmp_path / "ball" / "viewer.html").read_text())
@@ -50,7 +51,7 @@ def test_the_mesh_is_moved_and_the_page_shows_it_in_place(tmp_path, asset, views
 
 def test_the_page_of_a_refined_result_has_both(tmp_path, asset, views):
     start = replace(asset, mesh=ball_mesh(2, 0.6))
-    written(tmp_path / "ball", results.encode(asset, views, RECORD, name="ball", before=start))
+    written(tmp_path / "ball", asset, views, before=start)
     page = (tmp_path / "ball" / "viewer.html").read_text()
     extras = {k: RECORD[k] for k in ("output_from_input", "model_from_input", "weights")}
     shown = dict(re.findall(r'"name": "(after|before)", "glb": "([^"]*)"', page))
@@ -62,10 +63,10 @@ def test_the_page_of_a_refined_result_has_both(tmp_path, asset, views):
 def test_what_cannot_be_encoded_leaves_the_old_result(tmp_path, asset, views, threads, count):
     threads(count)
     folder = tmp_path / "ball"
-    written(folder, results.encode(asset, views, RECORD, name="ball"))
+    written(folder, asset, views)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     broken = replace(asset, textures=replace(asset.textures, base_color=asset.textures.base_color * torch.nan))
     with pytest.raises(ValueError, match="base_color"):
-        written(folder, results.encode(broken, views, RECORD, name="ball"))
+        written(folder, broken, views)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     assert [path.name for path in tmp_path.iterdir()] == ["ball"]

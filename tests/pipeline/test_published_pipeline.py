@@ -43,7 +43,8 @@ def test_weights_evaluated_near_the_surface_give_the_published_mesh(goldens):
     assert not unknown and not [k for k in missing if k.startswith(("heads.", "merger."))]
     none = torch.zeros(1)
     code = Code(torch.from_numpy(data["triplane"]), none, none, none, none)
-    flat = pipeline._grid(16, 0.87, torch.device("cpu")).reshape(-1, 3)
+    axis = torch.linspace(-0.87, 0.87, 17)
+    flat = torch.cartesian_prod(axis, axis, axis)
     sdf = model.sdf(model.query(code, flat[None], ("density",))["density"])[0, :, 0].view(17, 17, 17)
     weights = field.TriplaneField(None, model, code).cube_weights(flat, sdf)
     got = extract_surface(sdf, radius=0.87, closed=False, weights=weights)
@@ -57,7 +58,8 @@ def test_weights_evaluated_near_the_surface_give_the_published_mesh(goldens):
 def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
     """Also where the cap touches the box, away from every cube that the surface crosses inside."""
     code, n = tiny.encode(*views(1, 2, 76)), 12
-    flat = pipeline._grid(n, 0.87, torch.device("cpu")).reshape(-1, 3)
+    axis = torch.linspace(-0.87, 0.87, n + 1)
+    flat = torch.cartesian_prod(axis, axis, axis)
     raw = tiny.query(code, flat[None], ("density", "deformation", "flexicubes"))
     sdf = tiny.sdf(raw["density"])[0, :, 0].view(13, 13, 13)
     if half_space:
@@ -76,15 +78,15 @@ def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
 
 
 @torch.no_grad()
-def test_grid_sdf_equals_free_sdf_at_the_grid_points(tiny):
+def test_grid_sdf_equals_queries_at_the_grid_points(tiny):
     """Also with the box of one axis away from the middle."""
     code, maps = tiny.encode(*views(1, 2, 76)), SimpleNamespace(c2w=torch.zeros(2, 4, 4))
     axis = torch.linspace(-0.8, 0.6, 61)  # points of more than one tile of the kernel
-    own = field.TriplaneField(maps, tiny, code)
-    expected = own.free_sdf(torch.cartesian_prod(axis, axis, axis)).view(61, 61, 61)
+    queried = tiny.query(code, torch.cartesian_prod(axis, axis, axis)[None], ("density",))["density"]
+    expected = tiny.sdf(queried).view(61, 61, 61)
     assert float(expected.min()) < 0 < float(expected.max())
     # sums of 24 float32 products in another order, behind exp
-    torch.testing.assert_close(own.grid_sdf(axis), expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(field.TriplaneField(maps, tiny, code).grid_sdf(axis), expected, rtol=1e-4, atol=1e-4)
 
 
 @torch.no_grad()

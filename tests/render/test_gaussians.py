@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.latlong import texel_solid_angles
 from tests.support import reference
+from tests.support.lobes import irradiance
 from tests.support.surfaces import on_ball
 
 ROWS = 96  # midpoint rule; a lobe of sharpness 200 is 4 degrees wide, two rows
@@ -40,23 +41,6 @@ def leaves(tensors):
     return [t.clone().requires_grad_() for t in tensors]
 
 
-def test_value_and_gradients_match_the_definition(device):
-    own, rng = leaves(lobes(device)), torch.Generator().manual_seed(1)
-    d = normalize(torch.randn(300, 3, generator=rng), dim=-1).to(device).requires_grad_()
-    doubles, at = leaves([t.detach().double() for t in own]), d.detach().double().requires_grad_()
-    weight = torch.rand(300, 3, generator=rng).to(device)
-    got = SphericalGaussians(*own).lookup(d)
-    expected = light_at(at, *doubles)
-    torch.testing.assert_close(got.double(), expected, rtol=2e-5, atol=1e-6)  # sharpness 150 times float32 noise
-    grads = torch.autograd.grad((got * weight).sum(), [*own, d])
-    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), [*doubles, at])
-    # the squared chord and the cosine differ in derivative by multiples of the unit vectors: compare across them
-    for k, v in ((0, own[0]), (3, d)):
-        assert reference.rows_within(*(reference.across(g[k], v) for g in (grads, expected_grads))) >= 0.999, k
-    for k in (1, 2):
-        assert reference.fraction_within(grads[k], expected_grads[k]) >= 0.999, k
-
-
 def test_irradiance_and_gradients_match_quadrature(device):
     """Every sharpness from nearly constant to 150 and normals all around, behind the lobe too."""
     d, solid = sphere()
@@ -64,7 +48,7 @@ def test_irradiance_and_gradients_match_quadrature(device):
     normals = normalize(torch.randn(48, 3, generator=rng), dim=-1).to(device).requires_grad_()
     doubles, at = leaves([t.detach().cpu().double() for t in own]), normals.detach().cpu().double().requires_grad_()
     expected = ((at @ d.T).clamp(min=0.0) * solid) @ light_at(d, *doubles)
-    got = SphericalGaussians(*own).irradiance(normals)
+    got = irradiance(SphericalGaussians(*own), normals)
     # the fit errs by 0.2 % of a lobe's maximum each, here with random signs over 24 lobes
     assert float((got.detach().cpu().double() - expected.detach()).abs().max()) < 3e-3 * float(expected.detach().max())
     weight = torch.rand(48, 3, generator=rng)
@@ -89,7 +73,7 @@ def test_irradiance_is_exact_along_the_axis(device, sharpness):
     own = s.detach().float().to(device).requires_grad_()
     light = SphericalGaussians(axis, own, torch.ones(1, 3, device=device))
     for sign, value in zip((1.0, -1.0), expected, strict=True):
-        got = light.irradiance(sign * axis)
+        got = irradiance(light, sign * axis)
         # float32, and at 300 the far side is 1e-131: 0
         torch.testing.assert_close(got.cpu().double(), value.expand(1, 3), rtol=2e-5, atol=1e-6)
         gradients = torch.autograd.grad(got.sum() / 3.0, own), torch.autograd.grad(value, s, retain_graph=True)
@@ -161,11 +145,7 @@ def test_gradients_stay_finite_at_the_edges(device):
     sharpness[3:5], amplitude[5] = torch.tensor([0.01, 0.5]), 0.0
     inputs = leaves(t.to(device) for t in (normal, wo, base, rough, metal, axis, sharpness, amplitude))
     light = SphericalGaussians(*inputs[5:])
-    for out in (
-        shade_gaussians(*on_ball(*inputs[:5]), light),
-        light.irradiance(inputs[0]),
-        light.lookup(inputs[1]),
-    ):
+    for out in (shade_gaussians(*on_ball(*inputs[:5]), light), irradiance(light, inputs[0])):
         grads = torch.autograd.grad(out.sum(), inputs, allow_unused=True)
         assert bool(torch.isfinite(out).all()) and float(out.detach().min()) >= 0.0
         assert all(g is None or bool(torch.isfinite(g).all()) for g in grads)
@@ -177,7 +157,6 @@ def test_bad_input_and_empty_batches(device):
     with pytest.raises(ValueError, match="expected \\(K, 3\\)"):
         SphericalGaussians(axis, sharpness[:2], amplitude)
     light = SphericalGaussians(axis, sharpness, amplitude)
-    assert light.lookup(axis[:0]).shape == (0, 3)
     rows = shading_inputs(device)
     assert shade_gaussians(*on_ball(*(r[:0] for r in rows)), light).shape == (0, 3)
     with pytest.raises(ValueError, match="wo: expected"):

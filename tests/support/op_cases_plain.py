@@ -7,7 +7,7 @@ from reli3d.geometry import bake, hull
 from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
-from reli3d.geometry.rays import RayScene, offset_origin
+from reli3d.geometry.rays import RayScene
 from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.visibility import visible_from
 from reli3d.nn import view_lookup
@@ -116,7 +116,6 @@ def drawn(u, radiance, wo, alpha):
         light.pdf(wi),
         wi,
         material.pdf_lobes(wo, alpha, wi),
-        offset_origin(wo, wi, directions),
     )
 
 

@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+import warp as wp
 
+from reli3d._bridge import launch
 from reli3d.geometry.rays import RayScene
+from reli3d.kernels import rays as kernels
 from reli3d.render.volume import RaySamples
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BACKENDS = ["embree", "warp"]
 # stretch and shift of meshes and rays: plain, tiny, long, flat, far
@@ -65,3 +70,24 @@ def packed(counts, device, step=0.05, seed=2):
     total = int(first[-1])
     density, color = torch.rand(total, generator=rng) * 30 - 3, torch.rand(total, 3, generator=rng)
     return RaySamples(ray.to(device), t.to(device), first.to(device), step), density.to(device), color.to(device)
+
+
+@wp.kernel
+def offset_origin_kernel(
+    start: int,
+    position: wp.array[wp.vec3],
+    ng: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    scale: float,
+    origin: wp.array[wp.vec3],  # out
+):
+    i = start + wp.tid()
+    origin[i] = kernels.offset_origin(position[i], ng[i], direction[i], scale)
+
+
+def offset_origin(position, ng, direction, scale):
+    """Origins ``(N, 3)`` as the kernels of the package move them off their own face."""
+    out = torch.empty_like(position)
+    ins = [v.contiguous() for v in (position, ng, direction)]
+    launch(offset_origin_kernel, len(out), [*ins, float(scale), out], out.device)
+    return out

@@ -222,3 +222,10 @@ def grid_samples(planes, points):
         got = torch.nn.functional.grid_sample(planes[:, k], grid, align_corners=False, padding_mode="zeros")
         out.append(got.squeeze(2).transpose(1, 2))
     return torch.cat(out, -1)
+
+
+def decode_normals(encoded: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
+    """Unit world-space normals of normal map values ``(..., 3)``, as a renderer decodes them."""
+    t, local = tangent[..., :3], encoded * 2.0 - 1.0
+    b = torch.linalg.cross(normal, t) * tangent[..., 3:]
+    return torch.nn.functional.normalize(local[..., :1] * t + local[..., 1:2] * b + local[..., 2:] * normal, dim=-1)

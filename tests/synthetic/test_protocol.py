@@ -144,22 +144,3 @@ def test_missing_ground_truth_is_none_and_takes_part_in_no_loss(rendered):
         assert (views.material is not None, views.normal is not None, views.shown is not None) == (known,) * 3
         terms = object_losses(ball_model(), draw([source], (0, 1), **sizes), stage, gradients)
         assert {"image", "mask"} <= set(terms) and ({"material", "normal"} <= set(terms)) == known
-
-
-@pytest.mark.parametrize(
-    "options, word",
-    [
-        (["--protocol", "paper", "--views", "8"], "--views: expected none"),
-        (["--meshes", "empty"], "expected GLB files"),
-        (["--workers", "2", "--ray", "auto"], "not allowed with"),
-        (["--protocol", "paper", "--held-out", "test"], "expected at least 3 for --protocol paper"),
-    ],
-)
-def test_wrong_options_end_with_2_and_one_line(rendered, options, word, capsys, tmp_path, monkeypatch):
-    (tmp_path / "empty").mkdir()
-    monkeypatch.chdir(tmp_path)
-    try:
-        code = data.main(["render", "out", "--maps", str(rendered / "maps.npz"), *options])
-    except SystemExit as error:  # of the parser of arguments
-        code = error.code
-    assert code == 2 and word in capsys.readouterr().err and not (tmp_path / "out").exists()

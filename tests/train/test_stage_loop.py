@@ -273,12 +273,6 @@ def test_a_missing_tensorboard_is_reported_in_one_line(folder, tmp_path, monkeyp
     assert not (tmp_path / "run").exists()
 
 
-def test_options_of_another_stage_are_refused(folder, tmp_path, capsys):
-    for stage, option in (("small", "--lobes"), ("volume", "--points"), ("small", "--image-size")):
-        assert main([str(folder), str(tmp_path / "run"), "--stage", stage, option, "8"]) == 2
-        assert f"{option}: expected none for stage {stage}" in capsys.readouterr().err
-
-
 def test_the_strategies_of_a_stage_can_be_chosen(folder, tmp_path):
     call = [str(folder), str(tmp_path), "--stage", "monte_carlo", "--samples", "16", "0", "0", "--no-shadows"]
     config = paper_stage(parsed(call)).config

@@ -9,7 +9,6 @@ import pytest
 import torch
 from PIL import Image
 
-from reli3d.errors import InputError
 from reli3d.views.choose import DUPLICATE_DISTANCE_RAD, choose_views, spread_notes, view_distances
 from reli3d.views.folder import MAX_VIEWS, load_views
 from tests.support import hostile
@@ -92,11 +91,7 @@ def test_a_folder_of_sixty_is_read_as_its_four_distinct_views(tmp_path):
     whole = load_views(tmp_path, every=True)
     assert len(whole) == 60 and whole.notes == views.notes and torch.equal(whole.taken().c2w, views.c2w)
     assert whole.taken().taken() is not whole and len(whole.taken().taken()) == 4
-    first = load_views(tmp_path, first_views=4)
-    assert torch.allclose(first.c2w, cameras[:4], atol=1e-5) and len(first.notes) == 2  # near-duplicates, narrow
     assert len(load_views(tmp_path, views=MAX_VIEWS)) == MAX_VIEWS
-    with pytest.raises(InputError, match="got both"):
-        load_views(tmp_path, views=4, first_views=4)
 
 
 def cut_off(path, count, which) -> None:
@@ -121,8 +116,6 @@ def test_views_that_cut_the_object_off_are_left_out_while_eight_remain(tmp_path)
     every = load_views(tmp_path / "twelve", every=True)
     assert len(every) == 12 and every.taken().names == others
     assert set(load_views(tmp_path / "twelve", views=4).names) <= set(others)
-    first = load_views(tmp_path / "twelve", first_views=4)  # as requested
-    assert len(first) == 4 and any(n.endswith("; used all the same") for n in first.notes)
     cut_off(tmp_path / "ten", 10, (0, 3, 7))  # seven others
     views = load_views(tmp_path / "ten")
     assert len(views) == 10 and any(n.startswith(named) and n.endswith("; used all the same") for n in views.notes)

@@ -91,7 +91,7 @@ def test_a_far_folder_reads_as_a_near_one(tmp_path):
     torch.testing.assert_close(got, eyes, rtol=0, atol=5e-7)
     assert far.select(1).transformed(Similarity.identity()).origin == far.origin
     every = load_views(tmp_path / "far", every=True)
-    assert load_views(tmp_path / "far", first_views=2).origin == every.origin == far.origin
+    assert load_views(tmp_path / "far", views=2).origin == every.origin == far.origin
 
 
 @pytest.mark.parametrize("options", [[], ["--up", "z"]])

@@ -47,7 +47,6 @@ def test_object_folder_as_published(tmp_path):
     torch.testing.assert_close(views.c2w, torch.tensor([hostile.pose(2.1 * i) for i in (2, 1, 0)]), rtol=0, atol=1e-6)
     assert len(views.notes) == 1
     assert "0.7 radians" in views.notes[0]
-    assert load_views(tmp_path, first_views=2).names == views.names[:2]
 
 
 def test_blender_folder(tmp_path):
@@ -185,12 +184,10 @@ def test_number_of_views(tmp_path):
     frames = hostile.good(tmp_path)["frames"] * 7
     transforms(tmp_path, frames)
     assert len(load_views(tmp_path)) == 3  # an image listed seven times is used once
-    for options in ({"views": MAX_VIEWS}, {"first_views": MAX_VIEWS}):
-        assert len(load_views(tmp_path, **options)) == MAX_VIEWS
-    for name in ("views", "first_views"):
-        for wrong in (0, 17, -1, True, 2.0):
-            with pytest.raises(InputError, match=f"^{name}: expected 1 to 16"):
-                load_views(tmp_path, **{name: wrong})
+    assert len(load_views(tmp_path, views=MAX_VIEWS)) == MAX_VIEWS
+    for wrong in (0, 17, -1, True, 2.0):
+        with pytest.raises(InputError, match="^views: expected 1 to 16"):
+            load_views(tmp_path, views=wrong)
 
 
 def test_rounding_in_the_matrix_is_cleaned_up(tmp_path):

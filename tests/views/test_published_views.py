@@ -52,7 +52,7 @@ def test_a_render_is_prepared_as_published(goldens, shared_data):
 
 def test_a_capture_is_prepared_as_published(goldens, shared_data):
     golden = load_file(goldens / "mapper_UCO3D_217-72983-41010.safetensors")
-    views = load_views(shared_data / "captures" / "UCO3D_217-72983-41010", first_views=2)
+    views = load_views(shared_data / "captures" / "UCO3D_217-72983-41010", every=True).select(2)
     assert np.abs(views.c2w.numpy() - golden["in.c2w"]).max() < 1e-6
     batch = published_views(views, 512)
 

@@ -58,10 +58,10 @@ def fitted(
     for done, path in enumerate(missing):
         with safe_open(path, "pt") as file:
             light = quarter_turn(file.get_tensor("environment").float(), -1)  # stored with -Z at the horizontal center
-        found = fit_latent(decoder, light.to(decoder.sample_directions.device), steps=steps)
-        known[f"{path.stem}.latent"], known[f"{path.stem}.strength"] = found.latent.cpu(), found.strength.cpu()
+        latent, strength, error = fit_latent(decoder, light.to(decoder.sample_directions.device), steps=steps)
+        known[f"{path.stem}.latent"], known[f"{path.stem}.strength"] = latent.cpu(), strength.cpu()
         if done % 16 == 15:
-            progress(f"latents: {done + 1} of {len(missing)} lights, the last with error {found.error:.3f}")
+            progress(f"latents: {done + 1} of {len(missing)} lights, the last with error {error:.3f}")
     if missing:
         cache.parent.mkdir(parents=True, exist_ok=True)
         with replacing(cache) as temporary:

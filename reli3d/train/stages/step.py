@@ -24,7 +24,6 @@ DIFFUSE_MODEL = "published"  # the formula of the images of reli3d.synthetic.sam
 
 
 def encode(model: Reconstructor, drawn: Draw, *, bfloat16: bool = False) -> Code:
-    """The network's encoding of the input views."""
     views = drawn.inputs
     shown = torch.tensor([drawn.background_visible], device=views.images.device)
     with torch.autocast(views.images.device.type, torch.bfloat16, enabled=bfloat16):

@@ -64,7 +64,7 @@ def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None
     """
     radius, threshold = model.preset.radius, model.preset.density_threshold
     axis = torch.linspace(-radius, radius, resolution + 1, device=code.latent.device)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    points = torch.cartesian_prod(axis, axis, axis)
     with torch.no_grad():
         free = model.sdf(_densities(model, code, points)).view((resolution + 1,) * 3) / threshold
         cubes = surface_cubes(free)
@@ -101,7 +101,7 @@ def seed_surface(model: Reconstructor, code: Code) -> Tensor:
     As in nvdiffrec: an object without a surface would otherwise have no gradient.
     """
     axis = torch.linspace(-1.0, 1.0, 8, device=code.latent.device)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    points = torch.cartesian_prod(axis, axis, axis)
     far = points.abs().amax(-1)
     raw = query_heads(model, code, points * model.preset.radius, ("density",))["density"][:, 0] - model.surface_density
     return relu(1.0 - raw[far < CORE]).mean() + relu(1.0 + raw[far > 0.99]).mean()

@@ -14,14 +14,14 @@ from safetensors import safe_open
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
-from reli3d._bridge import present
+from reli3d._bridge import Movable, mapped, present
 from reli3d.errors import InputError
 
 Chooser = Callable[[int], Sequence[int]]  # maps the number of available views to the indices to load
 
 
 @dataclass(frozen=True)
-class ObjectViews:
+class ObjectViews(Movable):
     """``V`` views of ``S`` by ``S`` pixels in the model's frame, float32."""
 
     images: Tensor  # (V, S, S, 3) sRGB, straight alpha
@@ -40,17 +40,9 @@ class ObjectViews:
         return len(self.images)
 
     def select(self, views: Sequence[int]) -> "ObjectViews":
-        """The views of these indices, in this order."""
         chosen = torch.as_tensor(list(views))
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("latent", "strength")}
-        taken: dict[str, Any] = {k: v[chosen] for k, v in values.items() if isinstance(v, Tensor)}
-        return replace(self, **taken)
-
-    def to(self, device: torch.device | str) -> "ObjectViews":
-        """The same views on ``device``."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        moved: dict[str, Any] = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
-        return replace(self, **moved)
+        of_views = mapped(replace(self, latent=None, strength=None), lambda values: values[chosen])
+        return replace(of_views, latent=self.latent, strength=self.strength)
 
     def resized(self, size: int) -> "ObjectViews":
         """The views at ``size`` pixels per side, antialiased; maps are averaged over the pixels that have values."""
@@ -154,17 +146,13 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Draw:
+class Draw(Movable):
     """One object of a training step: input views, the reference view first, and target views."""
 
     inputs: ObjectViews
     targets: ObjectViews
     background_visible: bool
     seed: int  # of the rendering
-
-    def to(self, device: torch.device | str) -> "Draw":
-        """The same on ``device``."""
-        return replace(self, inputs=self.inputs.to(device), targets=self.targets.to(device))
 
 
 def draw(
