@@ -1,11 +1,12 @@
 """Surfaces with randomly exchanged materials, so that a network cannot infer the material from the shape.
 
-The surface is divided into one to four regions with sharp borders.  Each region gets one of: its original material, its
-base color with another roughness and metallic value, a scanned material set by triplanar projection, or a procedural
-material.
+The base color of most objects is multiplied by a random color.  The surface is divided into one to four regions with
+sharp borders.  Each region gets one of: its original material, its base color with another roughness and metallic
+value, a scanned material set by triplanar projection, or a procedural material.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -25,7 +26,10 @@ from reli3d.synthetic.noise import fbm
 from reli3d.synthetic.samples import Surface, random_faces
 
 UNCHANGED_PROBABILITY = 0.4  # of an object that keeps its base color in all regions
+RECOLORED_PROBABILITY = 0.6  # of an object whose base color is multiplied by a random color
+GAIN_DEVIATION, HUE_DEVIATION = 0.3, 0.12  # standard deviations of its logarithm: of all channels, of each channel
 REGION_COUNTS = (0.3, 0.35, 0.2, 0.15)  # probability of 1, 2, 3, 4 regions
+MAX_ALBEDO = 0.95  # of a base color that was multiplied, unless it was larger
 BLEND_EXPONENT = 8.0  # of |n| in the blend of the three projections: 1 % of a neighbor's weight at 30 degrees
 ROLES = ("metal", "metal", "plastic", "paint", "ceramic", "leather", "fabric", "rubber", "stone", "wood", "any")
 CLUSTER_POINTS = 2048  # surface points on which base colors are clustered
@@ -88,15 +92,19 @@ class RefinishedSurface:
         self._region = _draw_region(base, rng, count) if count > 1 else None
         kind = "keep" if kept else None
         self._finishes = [_draw_finish(sets, rng, kind, measured=measured, texels=texels) for _ in range(count)]
+        log = rng.normal(0, GAIN_DEVIATION) + rng.normal(0, HUE_DEVIATION, 3)
+        self._gain = torch.as_tensor(np.exp(log * (rng.random() < RECOLORED_PROBABILITY)), dtype=torch.float32)
 
     def distance(self, points: Tensor) -> Tensor:
         return self.base.distance(points)
 
     def points_at(self, face: Tensor, bary: Tensor) -> SurfacePoints:
-        points = self.base.points_at(face, bary)
+        original = self.base.points_at(face, bary)
+        color = torch.minimum(original.base_color * self._gain, original.base_color.clamp(min=MAX_ALBEDO))
+        points = replace(original, base_color=color)
         if self._region is None:
             return self._finishes[0](points)
-        region = self._region(points)
+        region = self._region(original)
         fields = ("position", "ng", "normal", "base_color", "roughness", "metallic")
         values = [getattr(points, name).clone() for name in fields]
         for k, finish in enumerate(self._finishes):
@@ -214,6 +222,6 @@ def _set_finish(folder: Path, rng: np.random.Generator, texels: int) -> Finish:
             bend[:, v] += tilt[:, 1]
         normal = functional.normalize(p.normal + strength * bend, dim=-1)
         rough = (number[:, 0] + shift).clamp(0.04, 1.0)
-        return _with_material(p, (color * gain).clamp(0.0, 0.95), rough, number[:, 1].clamp(0, 1), normal)
+        return _with_material(p, (color * gain).clamp(0.0, MAX_ALBEDO), rough, number[:, 1].clamp(0, 1), normal)
 
     return finish
