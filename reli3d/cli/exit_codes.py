@@ -6,6 +6,7 @@ removing partially written files.  Closed or full output streams and unencodable
 """
 
 import argparse
+import atexit
 import contextlib
 import functools
 import os
@@ -82,25 +83,28 @@ class _Stream:
 def command(name: str) -> Callable:
     """Decorator of a command's ``main`` that turns exceptions and signals into exit codes.  name: of the command.
 
-    Called without arguments, ``main`` is the whole program, and Ctrl-C is handled too.
+    Called without arguments, ``main`` is the whole program, and signals stay handled until the interpreter exits.
     """
 
     def decorate(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
         @functools.wraps(main)
         def run(argv: list[str] | None = None) -> int:
-            with _streams(), signals(interrupts=argv is None):
+            ended: list[int] = []  # the exit code once known: from then on a signal has nothing to clean up
+            with _streams(), signals(name if argv is None else None, ended):
                 try:
                     _parsed.set(None)
                     try:
-                        return main(argv)
+                        code = main(argv)
                     except InputError as error:
-                        return _report(name, str(error), 2)
+                        code = _report(name, str(error), 2)
                     except Exception as error:
-                        return _failed(name, error)
+                        code = _failed(name, error)
+                    ended.append(code)
                 except KeyboardInterrupt:
-                    return _report(name, ENDING["SIGINT"], 128 + signal.SIGINT)
+                    ended.append(_report(name, ENDING["SIGINT"], 128 + signal.SIGINT))
                 except Stopped as stop:
-                    return _report(name, ENDING[signal.Signals(stop.number).name], 128 + stop.number)
+                    ended.append(_report(name, ENDING[signal.Signals(stop.number).name], 128 + stop.number))
+            return ended[0]
 
         return run
 
@@ -188,10 +192,13 @@ def _report(name: str, text: str, code: int) -> int:
 
 
 @contextlib.contextmanager
-def signals(*, interrupts: bool = False) -> Iterator[None]:
+def signals(program: str | None = None, ended: list[int] | None = None) -> Iterator[None]:
     """In the block SIGTERM and SIGHUP raise :class:`Stopped`; signals after the first one are ignored.
 
-    interrupts: the same for SIGINT, which raises KeyboardInterrupt.
+    program: name of the command if it is the whole process; its handlers, also that of SIGINT, then stay installed.
+    Once ``ended`` has the exit code, a signal prints its line and exits immediately; without a signal the process exits
+    with that code after its threads and exit handlers, without freeing its objects.  None: the previous handlers are
+    restored after the block.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -199,21 +206,34 @@ def signals(*, interrupts: bool = False) -> Iterator[None]:
     numbers = [getattr(signal, n) for n in ENDING if hasattr(signal, n)]
     usual = (signal.SIG_DFL, signal.default_int_handler)
     before = {n: signal.getsignal(n) for n in numbers if signal.getsignal(n) in usual}  # nohup's SIG_IGN stays
-    if not interrupts:
+    if not program:
         before.pop(signal.SIGINT, None)  # raises KeyboardInterrupt already
 
     def stop(number: int, _) -> None:
         for other in before:
             signal.signal(other, signal.SIG_IGN)
+        if ended:
+            os.write(2, f"{program}: {ENDING[signal.Signals(number).name]}\n".encode())
+            os._exit(128 + number)  # the interpreter is ending: no exception would reach a handler
         raise KeyboardInterrupt if number == signal.SIGINT else Stopped(number)
 
+    def leave() -> None:
+        if ended:
+            for stream in (sys.stdout, sys.stderr):
+                with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, full, or None
+                    stream.flush()
+            os._exit(ended[0])
+
+    if program:  # Python heeds no signal while it frees its objects, for 1.6 s with torch: the process ends before
+        atexit.register(leave)  # called after all that is registered later
     for number in before:
         signal.signal(number, stop)
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        if not program:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 @contextlib.contextmanager

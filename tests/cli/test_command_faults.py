@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -14,7 +15,7 @@ from tests.support.processes import heed_signals
 
 # reli3d-infer without torch, which takes seconds to load, and without a network: its one object is {body}
 QUICK = """
-import sys, time, types
+import atexit, sys, threading, time, types
 from reli3d.cli import infer
 from reli3d.output.folder import claimed
 class Job:
@@ -34,6 +35,9 @@ WAITS = """with replacing() as new:
                 (new / "mesh.glb").write_text("mesh")
                 print("working", flush=True)
                 time.sleep(60)"""
+ENDS_LATE = f"""{WRITES}
+            threading.Thread(target=time.sleep, args=(0.4,)).start()
+            atexit.register(time.sleep, 0.4)"""
 
 
 def start(arguments, *, body=WRITES, **options) -> subprocess.Popen:
@@ -133,6 +137,39 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_result(tmp_path):
     assert len(lines_of(err)) == 1 and "File too large" in lines_of(err)[0] and "Traceback" not in err
     assert (tmp_path / "out/example/mesh.glb").read_text() == "old"
     assert {p.name for p in (tmp_path / "out").iterdir()} <= {"example", "example.reli3d.log"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs signals")
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_while_the_interpreter_ends_is_one_line_too(tmp_path, number, code):
+    """After the path is printed the process waits for a thread, then for functions registered at exit."""
+
+    def end(k, process):
+        assert process.stdout.readline().endswith("mesh.glb\n")
+        printed = time.monotonic()
+        time.sleep(0.15 * k)
+        early = time.monotonic() - printed < 0.75  # of 0.8
+        process.send_signal(number)
+        _, err = process.communicate(timeout=30)
+        found = (process.returncode, len(lines_of(err)))
+        assert found == (code, 1) or (not early and found == (0, 0)), (k, found, err)
+        assert "Traceback" not in err and "Exception" not in err
+        assert (tmp_path / f"out{k}/example/mesh.glb").read_text() == "mesh"
+        return process.returncode
+
+    processes = [start(["--output", tmp_path / f"out{k}"], body=ENDS_LATE) for k in range(6)]
+    with ThreadPoolExecutor(len(processes)) as pool:
+        assert code in list(pool.map(end, range(6), processes))
+
+
+@pytest.mark.parametrize("fails, code", [("", 0), ("; 1 / 0", 1)])
+def test_the_process_ends_before_python_frees_objects_and_ignores_signals(tmp_path, fails, code):
+    """Objects of torch take 1.6 s, in which no handler runs; here one takes a minute."""
+    kept = f"""atexit.register(print, "at exit")
+            sys.kept = type("Kept", (), {{"__del__": lambda self, sleep=time.sleep: sleep(60)}})(){fails}"""
+    process = start(["--output", tmp_path / "out"], body=f"{WRITES}\n            {kept}")
+    out, err = process.communicate(timeout=40)
+    assert process.returncode == code and out.endswith("at exit\n") and len(lines_of(err)) == code
 
 
 @pytest.mark.parametrize("error", ["ValueError", "ImportError", "OSError"])
