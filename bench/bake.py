@@ -34,30 +34,15 @@ def texels(device, subdivisions, size):
     return lambda: rasterize_texels(mesh, size), {"texels": size * size}
 
 
-def filling(device, subdivisions, size):
-    """Nine channels filled from the nearest valid texel."""
+def nearest(device, subdivisions, size):
+    """Nearest valid texel of every texel."""
     valid = rasterize_texels(sphere(device, subdivisions, size), size).valid
-    maps = torch.rand(size, size, 9, device=device)
-
-    def step():
-        source, square = nearest_valid(valid)
-        rows = (square > 0.0).view(-1).nonzero()[:, 0]
-        filled = maps.clone()
-        filled.view(-1, 9).index_copy_(0, rows, maps.view(-1, 9).index_select(0, source.view(-1)[rows]))
-        return filled
-
-    return step, {"texels": size * size}
+    return lambda: nearest_valid(valid), {"texels": size * size}
 
 
-def scipy_filling(device, subdivisions, size):
-    valid = rasterize_texels(sphere("cpu", subdivisions, size), size).valid
-    maps = torch.rand(size, size, 9).numpy()
-
-    def step():
-        y, x = ndimage.distance_transform_edt(~valid.numpy(), return_distances=False, return_indices=True)
-        return maps[y, x]
-
-    return step, {"texels": size * size}
+def scipy_nearest(device, subdivisions, size):
+    valid = ~rasterize_texels(sphere("cpu", subdivisions, size), size).valid.numpy()
+    return lambda: ndimage.distance_transform_edt(valid, return_indices=True), {"texels": size * size}
 
 
 def whole(device, subdivisions, size):
@@ -80,9 +65,9 @@ def glb(device, subdivisions, size):
 
 CASES = {
     "texels": (texels, dict(subdivisions=5, size=1024)),
-    "dilate": (filling, dict(subdivisions=5, size=1024)),
+    "nearest": (nearest, dict(subdivisions=5, size=1024)),
     "bake": (whole, dict(subdivisions=5, size=1024)),
     "tangents": (tangents, dict(subdivisions=5, size=1024)),
     "glb": (glb, dict(subdivisions=5, size=1024)),
 }
-PEERS = {"dilate": ("scipy", scipy_filling)}
+PEERS = {"nearest": ("scipy", scipy_nearest)}

@@ -194,12 +194,12 @@ def texture(
         known = known.index_select(0, source_vertices(whole, mesh))
 
     def surface(position: Tensor, normal: Tensor, tangent: Tensor, *values: Tensor) -> dict[str, Tensor]:
-        if local is not None:
+        if isinstance(field, TriplaneField):
+            got = field.material(position, normal)
+        else:
             heads, corners = values[0].split([HEAD_OUTPUTS, len(maps.images)], 1)
             visible = maps.visibility_within(present("scene", scene), position, normal, corners)
-            got = local.material_from_heads(heads, position, normal, visible)
-        elif isinstance(field, TriplaneField):
-            got = field.material(position, normal)
+            got = present("local", local).material_from_heads(heads, position, normal, visible)
         found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
         return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 

@@ -132,6 +132,8 @@ def render(args: argparse.Namespace) -> int:
     seeds = range(args.first, args.first + count)
     if args.held_out:
         seeds = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}[args.held_out]
+    elif seeds.stop > VALIDATION_SEEDS.start:
+        raise InputError("--first", f"expected seeds below {VALIDATION_SEEDS.start}, got {seeds.stop - 1}")
     args.output.mkdir(parents=True, exist_ok=True)
     ends = [f"_{k}" for k in range(LIGHTS)] if spec.paper else [""]
     names = [f"{seed:010d}{end}" for seed in seeds for end in ends]

@@ -37,7 +37,11 @@ def examine() -> tuple[list[tuple[str, str]], bool]:
 def _versions() -> Iterator[tuple[str, str]]:
     yield "reli3d", f"{reli3d.__version__} in {Path(reli3d.__file__).parent}"
     yield "python", f"{platform.python_version()} on {platform.platform()}"
-    required = [line for line in metadata.requires("reli3d") or [] if "extra ==" not in line]
+    try:
+        required = [line for line in metadata.requires("reli3d") or [] if "extra ==" not in line]
+    except metadata.PackageNotFoundError:
+        yield "dependencies", "unknown: reli3d is not installed"
+        return
     for package in (re.split(r"[^\w-]", line)[0] for line in required):
         try:
             yield package, metadata.version(package)

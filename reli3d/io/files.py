@@ -24,7 +24,8 @@ def read_bytes(path: str | os.PathLike, limit: int) -> bytes:
 
 @contextlib.contextmanager
 def opened(path: str | os.PathLike, mode: str = "rb", **options) -> Iterator[Any]:
-    """The file, open for reading; turns an OSError of the block into an InputError.  options: of Python's ``open``."""
+    """A regular file, open for reading; an OSError of the block becomes an InputError.  options: of ``open``."""
+    file_size(path)  # raises for a pipe, which would block
     try:
         with open(path, mode, **options) as file:
             yield file

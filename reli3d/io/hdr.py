@@ -17,7 +17,7 @@ from torch import Tensor
 from reli3d._bridge import expect
 from reli3d.errors import InputError, shown
 from reli3d.io.exr import read_exr
-from reli3d.io.files import file_size, opened, replacing, write_bytes
+from reli3d.io.files import opened, replacing, write_bytes
 from reli3d.io.rgbe import read_rgbe, rgbe_bytes
 from reli3d.render.environment import Environment
 
@@ -74,7 +74,6 @@ def read_hdr_image(path: str | os.PathLike, *, notes: list[str] | None = None) -
     For OpenEXR, the image is the display window, black outside the data window.  Colors in other primaries are
     converted.  ``notes`` and errors as in :func:`read_environment`.
     """
-    file_size(path)  # raises for a pipe, which would block
     with opened(path) as file:
         start = file.read(4)
     found: list[str] = []

@@ -25,7 +25,7 @@ from reli3d.synthetic.finishes import draw_materials
 from reli3d.synthetic.noise import fbm
 from reli3d.synthetic.samples import Surface, random_faces
 
-UNCHANGED_PROBABILITY = 0.4  # of an object that keeps its base color in all regions
+UNCHANGED_PROBABILITY = 0.4  # of an object without other materials; its base color may still be multiplied
 RECOLORED_PROBABILITY = 0.6  # of an object whose base color is multiplied by a random color
 GAIN_DEVIATION, HUE_DEVIATION = 0.3, 0.12  # standard deviations of its logarithm: of all channels, of each channel
 REGION_COUNTS = (0.3, 0.35, 0.2, 0.15)  # probability of 1, 2, 3, 4 regions
@@ -79,7 +79,7 @@ def _read_set(folder: Path, side: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class RefinishedSurface:
-    """``base`` with random materials: a ``Surface`` of :mod:`reli3d.synthetic.samples`.
+    """``base`` with random materials and base colors: a ``Surface`` of :mod:`reli3d.synthetic.samples`.
 
     sets: from :func:`material_sets`.  measured: whether roughness and metallic of ``base`` are ground truth rather than
     placeholders.  texels: resolution of a material set per unit of length, about two per pixel of a view.

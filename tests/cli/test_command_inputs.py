@@ -119,6 +119,7 @@ CASES = [
             (["few.npz", "--held-out", "test"], "--maps"),
             (["maps.npz", "--workers", "0"], "--workers"),
             (["maps.npz", "--first", "-5"], "--first"),
+            (["maps.npz", "--first", "999999999", "--count", "2"], "expected seeds below 1000000000, got 1000000000"),
             (["maps.npz", "--count", "0"], "--count"),
             (["maps.npz", "--views", "0"], "--views"),
             (["maps.npz", "--size", "0"], "--size"),

@@ -83,6 +83,15 @@ def test_missing_package_is_a_problem(assets, monkeypatch):
     assert not usable
 
 
+def test_a_checkout_that_is_not_installed_is_usable(monkeypatch):
+    def absent(name):
+        raise doctor.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(doctor.metadata, "requires", absent)
+    rows, usable = doctor.examine()
+    assert usable and dict(rows)["dependencies"].startswith("unknown") and "python" in dict(rows)
+
+
 @pytest.mark.parametrize("arguments", [["surgeon"], ["--now"]])
 def test_wrong_call_ends_with_two(arguments):
     assert doctor.main(arguments) == 2

@@ -114,6 +114,13 @@ def test_one_bad_object_leaves_the_others_bitwise_equal(example, tmp_path, capsy
     assert (tmp_path / "out/example/mesh.glb").stat().st_mtime_ns == before
 
 
+def test_check_explains_the_example_and_draws_the_rig(tmp_path, capsys):
+    assert check.main(["--output", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(load_views(infer.EXAMPLE)) == 12 and any("agree" in line for line in lines)
+    assert (tmp_path / "example" / "rig.png").stat().st_size > 10_000
+
+
 def test_wrong_cameras_end_the_check_with_3_and_are_named_where_the_reconstruction_fails(tmp_path, capsys):
     folder = moved_example(tmp_path / "object", torch.eye(4, dtype=torch.float64))
     data = json.loads((folder / "transforms.json").read_text())

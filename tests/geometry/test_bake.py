@@ -16,7 +16,7 @@ from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import unwrap
-from reli3d.io.glb import write_glb
+from reli3d.io.glb import encode_image, write_glb
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import srgb_to_linear
 from tests.support import gltf
@@ -395,3 +395,10 @@ def test_known_color_reads_back_from_the_file_of_an_extracted_surface(tmp_path, 
     size = 1024 if n > 24 else 512
     write_glb(tmp_path / "a.glb", baked(mesh, size))
     assert check_file(tmp_path / "a.glb", mesh) < 0.5 * STEP  # smooth charts: 8 bit alone is a quarter of a step
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (33, 64)])
+def test_png_is_exact(shape):
+    pixels = torch.randint(0, 256, (*shape, 3), generator=torch.Generator().manual_seed(1))
+    stored = np.asarray(Image.open(io.BytesIO(encode_image(pixels / 255.0))))
+    assert np.array_equal(stored, pixels.numpy())

@@ -1,5 +1,7 @@
 """COLMAP's binary models, against a model that COLMAP wrote in both forms."""
 
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -20,6 +22,16 @@ def photographs(folder):
         (folder / "images" / name).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels).save(folder / "images" / name)
     return folder
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path, name):
+    model = photographs(tmp_path) / "sparse/0"
+    colmap_model.write_binary(model)
+    (model / name).unlink()
+    os.mkfifo(model / name)
+    with pytest.raises(InputError, match="expected a regular file"):
+        load_views(tmp_path)
 
 
 def test_text_and_binary_of_one_model_are_the_same(tmp_path):
