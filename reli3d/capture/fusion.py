@@ -188,9 +188,9 @@ class _Expected:
     known: np.ndarray  # (H, W) bool
 
     def away(self, image: np.ndarray, gain: np.ndarray | float) -> np.ndarray:
-        """Distance ``(H, W, 3)`` between the colors of ``image`` and the plane's, which may lie a pixel apart.
+        """Distance ``(H, W, 3)`` between the colors of ``image`` and the plane's; a shift by one pixel is tolerated.
 
-        Each must occur in the other: any gray is among the colors of print within a pixel, but not the reverse.
+        It is compared in both directions: a gray lies within the range of a print's colors, but not the reverse.
         """
         image, plane = image.astype(np.float32), (self.color * gain).astype(np.float32)
         return np.maximum(_outside(image, plane), _outside(plane, image))

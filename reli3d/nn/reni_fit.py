@@ -21,11 +21,10 @@ def fit_latent(
 
     The error is the mean over the sphere of |log radiance - log map|; the latents absorb any rotation.
     radiance: ``(H, 2H, 3)`` linear, nonnegative, in the layout of :mod:`reli3d.render.latlong`, on the decoder's
-    device; H at least 8.  steps: of Adam, each on ``rays`` texels sampled uniformly over the sphere.  The strength is
-    initialized to the logarithm of the geometric mean.  The loss is the absolute difference of logarithms, with a floor
-    of a hundredth of the mean, plus one minus the cosine of the colors, which emphasizes light sources.  The decoder is
-    not changed.  Raises TypeError unless float32, ValueError for another shape and for a map that is not finite,
-    negative or black.  Source: Gardner et al. 2023, RENI++, section 4.
+    device; H at least 8.  steps: of Adam, each on ``rays`` texels sampled uniformly over the sphere.  The loss is the
+    absolute difference of logarithms, with a floor of a hundredth of the mean, plus one minus the cosine of the colors,
+    which emphasizes light sources.  The decoder is not changed.  Raises TypeError unless float32, ValueError for
+    another shape and for a map that is not finite, negative or black.  Source: Gardner et al. 2023, RENI++, section 4.
     """
     directions, target, weight = _rays(decoder, radiance)
     shade = target.mean(-1)

@@ -93,7 +93,7 @@ def test_a_smooth_surface_in_front_of_print_is_not_the_plane():
     text = np.random.default_rng(0).choice(np.float32([20, 230]), (40, 40, 1)).repeat(3, 2)
     plane = fusion._Expected(text, np.full((40, 40), 3.0), np.ones((40, 40), bool))
     assert plane.away(np.full((40, 40, 3), 125, np.uint8), 1.0).min() > 100
-    assert plane.away(np.roll(text, (1, -1), (0, 1)).astype(np.uint8), 1.0)[1:-1, 1:-1].max() == 0  # a pixel apart
+    assert plane.away(np.roll(text, (1, -1), (0, 1)).astype(np.uint8), 1.0)[1:-1, 1:-1].max() == 0  # shifted by a pixel
     assert plane.away((0.5 * text).astype(np.uint8), 0.5).max() == 0
 
 
