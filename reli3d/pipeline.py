@@ -283,9 +283,9 @@ class ReconstructOptions:
     the preset's.  normalization: a mode of :func:`~reli3d.views.normalize.normalize` or the
     :class:`~reli3d.views.similarity.Similarity` to the model frame; None: ``auto``, for the published network
     ``none``.  up: axis of the world that becomes +Y, such as ``-y``.  uv: ``project`` or ``xatlas``.  hero: index of
-    the reference view.  background: what the lighting estimate reads, ``masked`` (the object), ``visible``, or
-    ``auto`` (``visible`` if all views have a background and the weights read it).  symmetry: ``auto`` completes
-    objects with a mirror plane (bundled network only), or ``off``.  Raises InputError for an invalid value.
+    the reference view.  background: what the lighting estimate reads, ``masked`` (the object), ``visible`` (published
+    network only), or ``auto`` (``visible`` if all views have a background and the weights read it).  symmetry: ``auto``
+    completes objects with a mirror plane (bundled network only), or ``off``.  Raises InputError for an invalid value.
 
     >>> options = reli3d.ReconstructOptions(texture_size=512, symmetry="off")
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe"), options=options)
@@ -342,6 +342,10 @@ def place(views: Views, preset: Preset | LocalPreset, options: ReconstructOption
     return Placed(views, to_model, output_frame(options.up))
 
 
+def _reads_background(model: Network) -> bool:
+    return isinstance(model.preset, Preset) and model.preset.reads_background
+
+
 @torch.no_grad()
 @full_precision
 def reconstruct(views: Views, *, weights: str | Network = "small", device: str = "cpu",
@@ -372,9 +376,7 @@ def reconstruct(views: Views, *, weights: str | Network = "small", device: str =
 @full_precision
 def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptions, watch: Stopwatch) -> Asset:
     """:func:`reconstruct` after its first stage, :func:`place`."""
-    shown = background_shown(
-        placed.views, options.background, readable=getattr(model.preset, "reads_background", False)
-    )
+    shown = background_shown(placed.views, options.background, readable=_reads_background(model))
     with watch.stage("prepare"):
         prepared = prepare(model, placed.views, placed.model_from_input)
     if options.symmetry == "auto" and isinstance(model, LocalReconstructor):
@@ -502,13 +504,14 @@ def reconstruct_folder(
     progress = progress or Progress()
     watch = Stopwatch(model.device, progress)
     with watch.stage("reading"):
-        whole = published_input(model.preset) or options.background != "masked"
+        whole = published_input(model.preset) or (_reads_background(model) and options.background != "masked")
         photographs = reading.read(folder, whole=whole)
         views, batch = photographs.taken(), None
         fit: dict[str, Any] = {}
         if reading.budget:
             batch = photographs.resampled(REFINED)
             fit = {"light": reading.lighting(photographs), "cameras": reading.cameras, **reading.budget}
+        names = photographs.names
         del photographs  # 1 GB of 60 images of 1 MP
     if options.up == "y" and (axis := up_axis(views.c2w)) not in (None, "y"):
         views = replace(views, notes=(*views.notes, f"the cameras suggest {axis} as the up axis: try --up {axis}"))
@@ -534,6 +537,8 @@ def reconstruct_folder(
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
         frames, moved = results.frame_record(placed.model_from_input, output, views.origin, options.up)
         frames["weights"] = dict(weights)
+        if batch is not None and reading.cameras:
+            record["refinement"]["cameras"] = results.camera_record(names, result.c2w, moved)
         on_device = shown.to(model.device)
         sheet = preview(asset, on_device, scene)  # the longest tasks first, to balance the threads
         measured = results.measure(asset.mesh, scene, on_device)

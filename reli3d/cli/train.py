@@ -76,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="TIMES",
         help="multiplier of the learning rate of the 2D U-Net; 0.1 after stage pixels",
     )
-    small.add_argument("--maps", type=Path, help="environment maps, .npz, under which half of the samples are relit")
+    small.add_argument("--maps", type=Path, help="environment maps, .npz, under which 60 %% of the samples are relit")
     paper = p.add_argument_group("stages of the ReLi3D paper's network, and --image-size of pixels")
     paper.add_argument("--image-size", type=int, help="pixels per side; for stage pixels 64 (default), 128 or 256")
     paper.add_argument("--preset", choices=("tiny", "official"))

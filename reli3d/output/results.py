@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 import reli3d
 from reli3d.errors import printable
@@ -162,6 +163,13 @@ def frame_record(
         "model_from_input": model_from_views.compose(read).matrix().tolist(),
         "output_from_input": output.compose(read).matrix().tolist(),
     }, back.tolist()
+
+
+def camera_record(names: Sequence[str], c2w: Tensor, translation: Sequence[float]) -> dict[str, list]:
+    """Camera-to-world matrices by image name, in the scene frame of the GLB, whose mesh has ``translation``."""
+    exact = c2w.cpu().double()
+    exact[:, :3, 3] += torch.tensor(translation, dtype=torch.float64, device="cpu")
+    return dict(zip(names, exact.tolist(), strict=True))
 
 
 def weights_record(manifest: Manifest, digest: str) -> dict:

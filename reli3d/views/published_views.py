@@ -73,10 +73,13 @@ def hero_first(views: Views, hero: int) -> Views:
 
 def background_shown(views: Views, background: str, *, readable: bool) -> bool:
     """Whether the illumination branch sees the background: never if ``masked``, always if ``visible``, and if
-    ``auto`` where the weights were trained to (``readable``) and every view has one.  InputError on another word.
+    ``auto`` where the weights were trained to (``readable``) and every view has one.  Raises InputError for another
+    word, and for ``visible`` unless ``readable``.
     """
     if background not in BACKGROUNDS:
         raise InputError("background", f"expected {', '.join(BACKGROUNDS)}, got {background}")
+    if background == "visible" and not readable:
+        raise InputError("background", "expected masked or auto, as the weights ignore it, got visible")
     if background != "auto":
         return background == "visible"
     return readable and all(has_background(i, m) for i, m in zip(views.images, views.masks, strict=True))

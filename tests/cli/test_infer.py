@@ -19,7 +19,7 @@ from reli3d.render.color import srgb_to_linear
 from reli3d.render.image import render_asset
 from reli3d.views.folder import load_views
 from tests.support import hostile
-from tests.support.example import QUICK, moved_example
+from tests.support.example import EXAMPLE, QUICK, moved_example
 
 
 def command(tmp_path: Path, *arguments) -> int:
@@ -155,6 +155,12 @@ def test_json_is_one_object_on_stdout(tmp_path, capsys):
     assert (Path(made[0]["folder"]) / "mesh.glb").is_file()
 
 
+def test_weights_that_ignore_the_background_refuse_it(tmp_path, capsys):
+    assert command(tmp_path, "--background", "visible") == 2
+    assert "background: expected masked or auto" in capsys.readouterr().err
+    assert not any((tmp_path / "out").glob("*/*"))
+
+
 def test_a_negative_axis_may_be_a_word_of_its_own(tmp_path):
     for words in (["--up", "-z"], ["--up=-z"]):
         assert infer.parser().parse_args(joined(["a", *words], "--up", infer.AXES)).up == "-z"
@@ -162,10 +168,16 @@ def test_a_negative_axis_may_be_a_word_of_its_own(tmp_path):
 
 
 def test_refinement_writes_refine_png_and_its_loss_curve(tmp_path):
-    assert command(tmp_path, "--refine", "6steps", "--views", "3") == 0
+    assert command(tmp_path, "--refine", "6steps", "--refine-cameras", "--up", "z", "--views", "3") == 0
     folder = tmp_path / "out" / "example"
     assert sorted(p.name for p in folder.iterdir()) == sorted((*results.FILES, results.COMPARISON))
-    record = json.loads((folder / "run_info.json").read_text())["refinement"]
+    info = json.loads((folder / "run_info.json").read_text())
+    record = info["refinement"]
+    stored = load_views(EXAMPLE, every=True)
+    given = dict(zip(stored.names, torch.tensor(info["output_from_input"]).double() @ stored.c2w.double(), strict=True))
+    assert list(record["cameras"]) == info["views"]
+    for name, c2w in record["cameras"].items():  # a few steps move them little
+        torch.testing.assert_close(torch.tensor(c2w).double(), given[name], rtol=0, atol=0.05)
     assert sum(record["steps"].values()) == 6 and record["curve"]
     assert set(record["kept"]) == {"surface", "material", "light"}
     assert record["psnr_after"]["input"] is not None and record["views_held_out"] == [1]

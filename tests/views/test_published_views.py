@@ -102,7 +102,9 @@ def test_the_background_is_shown_where_there_is_one():
     assert background_shown(views, "auto", readable=True)
     assert not background_shown(views, "auto", readable=False)
     assert not background_shown(cut, "auto", readable=True)  # one view without is enough
-    assert background_shown(cut, "visible", readable=False) and not background_shown(views, "masked", readable=True)
+    assert background_shown(cut, "visible", readable=True) and not background_shown(views, "masked", readable=True)
+    with pytest.raises(ValueError, match="background: expected masked or auto, .* got visible"):
+        background_shown(views, "visible", readable=False)
     with pytest.raises(ValueError, match="background: expected auto, masked, visible, got black"):
         background_shown(views, "black", readable=True)
 
