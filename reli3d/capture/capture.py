@@ -22,11 +22,13 @@ from reli3d.capture.rigidity import Frame, Group, epipolar_fit, inside_mask, rig
 from reli3d.capture.scene import Scene, find_scene
 from reli3d.capture.sheet import contact_sheet
 from reli3d.errors import InputError, printable
-from reli3d.io.images import read_image
+from reli3d.io.images import decode_image, unit
 from reli3d.output.folder import check_place, claimed
 from reli3d.views.background import Remover
 from reli3d.views.check import agreement
 from reli3d.views.choose import choose_views
+from reli3d.views.file_names import images_in
+from reli3d.views.masks import mask_values
 from reli3d.views.views import Views
 
 RESULT_FILES = ("images", "masks", "transforms.json", "capture.json", "capture.png")
@@ -208,7 +210,7 @@ def _known_masks(photos: Sequence[Photo], options: CaptureOptions, progress: Pro
 def _given_mask(folder: Path, photo: Photo) -> np.ndarray | None:
     """The mask in ``folder`` by the photograph's name, with or without that one's suffix before its own."""
     files = []
-    for path in sorted(p for p in folder.iterdir() if p.is_file()):
+    for path in images_in(folder):
         before = Path(path.stem)
         if photo.name in (path.name, path.stem) or (
             before.suffix.lower() in PHOTO_SUFFIXES and photo.name == before.stem
@@ -218,10 +220,8 @@ def _given_mask(folder: Path, photo: Photo) -> np.ndarray | None:
         return None
     if len(files) > 1:
         raise InputError(folder, f"expected one mask of {printable(photo.name)}, got {files[0].name}, {files[1].name}")
-    color, alpha = read_image(files[0])
-    mask = np.rint((color.mean(-1) if alpha is None or bool((alpha == 1).all()) else alpha).numpy() * 255).astype(
-        np.uint8
-    )
+    coverage = unit(mask_values(files[0], decode_image(files[0]), []))  # the note on values below white is left out
+    mask = np.rint(255 * coverage).astype(np.uint8)
     if abs(mask.shape[1] * photo.size[1] / (mask.shape[0] * photo.size[0]) - 1) > 0.01:
         raise InputError(files[0], f"expected the aspect of {photo.size[0]} x {photo.size[1]}, got {mask.shape[::-1]}")
     return cv2.resize(mask, photo.size, interpolation=cv2.INTER_AREA)

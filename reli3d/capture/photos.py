@@ -123,7 +123,8 @@ def _read_photo(path: Path, name: str) -> Photo:
     longest = max(upright.size)
     focal = focal_from_exif(tags, stored, longest)
     lens = (upright.size, str(tags.get(ExifTags.Base.Model, "")), round(focal) if focal else None)
-    return Photo(name, np.asarray(upright), focal, lens, bool(_number(tags.get(ExifTags.Base.Flash), 0.0)) % 2 == 1)
+    fired = int(_number(tags.get(ExifTags.Base.Flash), 0.0)) % 2 == 1  # the other bits say how it was set
+    return Photo(name, np.asarray(upright), focal, lens, fired)
 
 
 def focal_from_exif(tags: dict, stored: tuple[int, int], longest: int) -> float | None:

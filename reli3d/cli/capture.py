@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -80,7 +81,7 @@ def _infer(folder: Path) -> int:
 
     if code := infer.main([str(folder), "--output", str(folder / "asset")]):
         return code
-    info = next((folder / "asset").glob("*/run_info.json"))
+    info = folder / "asset" / Path(os.path.abspath(folder)).name / "run_info.json"
     iou = json.loads(info.read_text())["mask_iou"]
     if iou >= LEAST_IOU:
         return 0

@@ -62,7 +62,7 @@ def main(argv: list[str] | None = None) -> int:
     from reli3d.pipeline import FolderOptions
 
     job = Check(FolderOptions(args.views, args.masks, args.remove_background), args.json)
-    rows = (objects.make(job, item, lambda error: show_traceback(error, args)) for item in items)
+    rows = (objects.make(job, item, lambda error: show_traceback(error, args), writes=False) for item in items)
     ended, code = objects.collect("reli3d check", rows, items, lambda row: None)
     if not code and any(found["suspect"] for found in job.found.values()):
         code = SUSPECT

@@ -40,8 +40,11 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--held-out", choices=("validation", "test"), help="objects of the validation or test set, under held-out maps"
     )
-    p.add_argument("--meshes", type=Path, nargs="+", help="GLB files or folders of them, instead of procedural objects")
-    p.add_argument(
+    source = p.add_mutually_exclusive_group()
+    source.add_argument(
+        "--meshes", type=Path, nargs="+", help="GLB files or folders of them, instead of procedural objects"
+    )
+    source.add_argument(
         "--shapes",
         type=Path,
         nargs="+",

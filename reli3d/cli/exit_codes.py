@@ -126,7 +126,7 @@ def _failed(name: str, error: Exception) -> int:
     """Reports an unexpected exception in one line, writes its traceback, and returns the exit code."""
     args = _parsed.get()
     show_traceback(error, args)
-    output = getattr(args, "output", None)
+    output = getattr(args, "file", None) or getattr(args, "output", None)
     log = write_log(output, error) if isinstance(output, Path) else None
     where = f"; traceback in {printable(str(log))}" if log else "; --traceback prints where"
     return _report(name, reason(error) + where, 1)

@@ -10,6 +10,7 @@ from reli3d.cli.exit_codes import Parser, check_range, command, extra
 from reli3d.errors import InputError
 
 FORMATS = ("glb", "obj", "usdz")
+BAKED, LEAST_BAKED = 1024, 128  # texels a side of a new atlas, unless the source has LEAST_BAKED or more
 
 
 def parser() -> argparse.ArgumentParser:
@@ -80,13 +81,15 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
         print(f"reli3d-export: {note}", file=sys.stderr)
     if len(parts) != 1:
         raise InputError(args.glb, f"expected a GLB with one surface, got {len(parts)}")
-    asset, size = parts[0], args.texture_size or parts[0].textures.size
+    asset = parts[0]
+    size = args.texture_size or asset.textures.size
+    baked = size if args.texture_size or size >= LEAST_BAKED else BAKED
     if args.decimate is not None and len(asset.mesh.faces) > args.decimate:
         with extra("--decimate"):
             mesh = decimate(asset.mesh, args.decimate)
-        asset = transfer_textures(replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)), asset, size)
+        asset = transfer_textures(replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)), asset, baked)
     elif size != asset.textures.size or (args.format != "glb" and not portable(asset)):
-        asset = transfer_textures(asset.mesh, asset, size)
+        asset = transfer_textures(asset.mesh, asset, baked)
     name = args.glb.stem
     if args.format == "glb":
         files = {f"{name}.glb": glb_bytes(asset, textures=args.textures)}

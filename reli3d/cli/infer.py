@@ -3,6 +3,7 @@
 import argparse
 import functools
 import json
+import os
 import re
 import sys
 from dataclasses import asdict
@@ -23,6 +24,8 @@ def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(joined(argv, "--up", AXES))
     check_ranges(args, workers=(1, 1024), views=(1, 16), texture_size=(256, 4096), resolution=(16, 256))
     items = checked_items(args)
+    for item in items:
+        _check_kept(item)
     device = choose_device(args.device)
     budget = refinement_budget(args, device)
     from reli3d.cli import job
@@ -60,6 +63,16 @@ def checked_items(args: argparse.Namespace) -> list[objects.Item]:
     if (args.output / objects.SUMMARY).is_dir():
         raise InputError(args.output / objects.SUMMARY, "expected a file or none, got a folder; give another --output")
     return items
+
+
+def _check_kept(item: objects.Item) -> None:
+    """Raises InputError if the result would replace files of the input that have the names of a result."""
+    from reli3d.output.results import OURS
+
+    if os.path.realpath(item.target) != os.path.realpath(item.folder) or (item.folder / "run_info.json").exists():
+        return
+    if found := [name for name in OURS if os.path.lexists(item.folder / name)]:
+        raise InputError("--output", f"expected a place outside the input, as its {found[0]} would be replaced")
 
 
 def choose_device(requested: str) -> str:

@@ -68,10 +68,11 @@ class Row:
 Rows = Generator[Row, None, None]
 
 
-def make(job: Job, item: Item, failed: Callable[[Exception], None] = lambda error: None) -> Row:
+def make(job: Job, item: Item, failed: Callable[[Exception], None] = lambda error: None, *, writes: bool = True) -> Row:
     """Makes one object; an error is returned as a row, and its traceback is written to a log file next to the target.
 
-    failed: called with an error other than InputError.
+    failed: called with an error other than InputError.  writes: whether the job writes a result to the target, which
+    replaces the log of an earlier run and whose ``run_info.json`` is read.
     """
     began = time.monotonic()
     try:
@@ -82,9 +83,11 @@ def make(job: Job, item: Item, failed: Callable[[Exception], None] = lambda erro
         failed(error)
         log = write_log(item.target, error)
         return Row(item.name, "failed", notes=(reason(error), *([f"traceback in {log}"] if log else [])))
+    seconds = round(time.monotonic() - began, 3) if row.result == "done" else None
+    if not writes:
+        return replace(row, seconds=seconds)
     with contextlib.suppress(OSError):
         log_of(item.target).unlink()  # of an earlier run
-    seconds = round(time.monotonic() - began, 3) if row.result == "done" else None
     return replace(row, seconds=seconds, **_recorded(item.target))
 
 

@@ -12,7 +12,7 @@ from reli3d.cli.exit_codes import Parser, check_ranges, command, extra
 from reli3d.errors import InputError
 
 FORMATS = ("png", "exr", "webp", "gif", "mp4")
-UNSUPPORTED_VIDEO = (".mov", ".avi", ".mkv", ".webm", ".m4v", ".apng")
+UNSUPPORTED = (".mov", ".avi", ".mkv", ".webm", ".m4v", ".apng", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".hdr")
 MOVING = ("webp", "gif", "mp4")  # one file of all frames
 STILL = ("png", "exr")  # one file a frame
 RATE = 24  # frames a second
@@ -143,7 +143,7 @@ def _check(args: argparse.Namespace) -> None:
     check_ranges(args, frames=(1, 3600), size=(1, 8192), supersampling=(1, 16), plan=(1, 65536), seed=(0, 10**9))
     if not all(0 <= k <= 65536 for k in args.samples) or sum(args.samples) == 0:
         raise InputError("--samples", f"expected three counts of 0 to 65536, one above 0, got {tuple(args.samples)}")
-    if args.output.suffix.lower() in UNSUPPORTED_VIDEO:
+    if args.output.suffix.lower() in UNSUPPORTED and not args.output.is_dir():
         raise InputError(
             "--output", f"expected a folder or a file of type .png, .exr, .webp, .gif or .mp4, got {args.output}"
         )
@@ -203,7 +203,12 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         camera = Camera.from_fov(look_at(eye, center, up), math.radians(args.fov), args.size, args.size)
         if args.plan is not None and frame == 0:
             relative = args.format != "exr"
-            plan = plan_render(parts, camera, environment, total=args.plan, relative=relative, options=options, **shown)
+            counts: Any = {"total": args.plan, "relative": relative, "options": options}
+            try:
+                plan = plan_render(parts, camera, environment, **counts, **shown)
+            except ValueError as error:  # no ray hits the object
+                raise InputError("--plan", f"{error}; bring the camera nearer") from None
+            args.samples = plan.samples
             options = replace(options, samples=plan.samples, antithetic="none")
             print("reli3d-render: samples by strategy", *plan.samples, file=sys.stderr)
         turned = environment if args.turn == "camera" else environment.rotated(turn)

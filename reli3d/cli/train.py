@@ -108,6 +108,8 @@ def parsed(argv: list[str] | None) -> argparse.Namespace:
     check_ranges(args, image_size=(8, 2048), patch=(0, 2048), targets=(1, 16), lobes=(1, 4096), resolution=(4, 256))
     check_folder(args.output)
     if "export" in args:
+        if args.export.is_dir():
+            raise InputError("--export", f"expected a file, got the folder {args.export}; add a name")
         check_folder(args.export.parent)
     if "tensorboard" in args:
         check_folder(args.tensorboard)
@@ -282,7 +284,9 @@ def main(argv: list[str] | None = None) -> int:
     makers = {LIGHT_PRIOR: light_prior_stage, **dict.fromkeys(SMALL_STAGES, small_stage)}
     stage = makers.get(args.stage, paper_stage)(args)
     if "export" in args:
-        print(weights.save(args.export, export(args, stage), license=getattr(args, "license", "not stated")).path)
+        model = export(args, stage)
+        args.export.parent.mkdir(parents=True, exist_ok=True)
+        print(weights.save(args.export, model, license=getattr(args, "license", "not stated")).path)
         return 0
     settings = given(args, *OF_LOOP)
     if "tensorboard" in settings:

@@ -20,7 +20,7 @@ from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.points import SurfacePoints
 
-MAX_SURFACE_DISTANCE = 0.08  # of the surfaces along the new one's normal, in the box [-1, 1]^3
+MAX_SURFACE_DISTANCE = 0.04  # of the surfaces along the new one's normal, of the longest side
 
 
 def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
@@ -29,7 +29,8 @@ def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, 
     The first hit from outside along the normal within ``MAX_SURFACE_DISTANCE``, otherwise the nearest vertex.
     """
     scene = RayScene(mesh.vertices, mesh.faces)
-    hits = scene.closest(position + MAX_SURFACE_DISTANCE * normal, -normal, t_max=2.0 * MAX_SURFACE_DISTANCE)
+    reach = MAX_SURFACE_DISTANCE * float((mesh.vertices.amax(0) - mesh.vertices.amin(0)).max())
+    hits = scene.closest(position + reach * normal, -normal, t_max=2.0 * reach)
     face, bary = hits.face.clone(), hits.bary.clone()
     missed = torch.nonzero(face < 0)[:, 0]
     if len(missed):

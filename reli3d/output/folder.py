@@ -149,7 +149,7 @@ def _work(folder: Path) -> Path:
 def _locked(work: Path, folder: Path) -> int:
     """Descriptor of the lock in ``work``, which this process now holds.  Raises OSError where another one does."""
     while True:
-        work.mkdir(exist_ok=True)
+        work.mkdir(parents=True, exist_ok=True)  # another process may have removed the empty parent
         try:
             lock = os.open(work / "lock", os.O_RDWR | os.O_CREAT)
         except FileNotFoundError:  # another process has just removed it

@@ -165,11 +165,11 @@ def frame_record(
     }, back.tolist()
 
 
-def camera_record(names: Sequence[str], c2w: Tensor, translation: Sequence[float]) -> dict[str, list]:
-    """Camera-to-world matrices by image name, in the scene frame of the GLB, whose mesh has ``translation``."""
+def camera_record(names: Sequence[str], c2w: Tensor, translation: Sequence[float]) -> list[dict]:
+    """Names and camera-to-world matrices of views, in the scene frame of the GLB, whose mesh has ``translation``."""
     exact = c2w.cpu().double()
     exact[:, :3, 3] += torch.tensor(translation, dtype=torch.float64, device="cpu")
-    return dict(zip(names, exact.tolist(), strict=True))
+    return [{"name": n, "transform_matrix": m} for n, m in zip(names, exact.tolist(), strict=True)]
 
 
 def weights_record(manifest: Manifest, digest: str) -> dict:

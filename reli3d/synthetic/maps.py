@@ -13,8 +13,17 @@ from reli3d.io.files import file_size
 from reli3d.render.latlong import lat_long_directions, quarter_turn, texel_solid_angles
 
 ROWS = 64
-# of numpy, zipfile and zlib for a cut, changed, encrypted or unknown file
-BROKEN_ARCHIVE = (ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
+# of numpy, zipfile and zlib for a cut, changed, encrypted or unknown file; the second and third of an .npy file
+BROKEN_ARCHIVE = (
+    ValueError,
+    TypeError,
+    AttributeError,
+    OSError,
+    EOFError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 HELD_OUT_EVERY = 6  # every sixth map is held out of all training
 
 

@@ -92,8 +92,9 @@ def agreement(views: Views) -> tuple[Hull, list[float]]:
 
 def _filled(hull: Hull, mask: Tensor, pose: Tensor, camera: Tensor) -> float:
     pixels, depth = project(hull.points.float(), pose.float().cpu(), camera.float().cpu())
-    step = max(1, math.ceil(float(camera[:2].max()) * hull.cell / float(depth.median())))  # a cell's footprint
     height, width = mask.shape
+    footprint = float(camera[:2].max()) * hull.cell / max(float(depth.median()), 1e-12)  # of a cell
+    step = max(1, min(math.ceil(footprint), max(height, width)))  # without end where the camera is inside the object
     blocks = max_pool2d(pad(mask.cpu(), (0, -width % step, 0, -height % step))[None], step)[0] > 0.5
     inside = (pixels >= 0).all(-1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     hit = torch.zeros(blocks.shape, dtype=torch.float32, device="cpu")

@@ -92,9 +92,9 @@ def load_views(
             read |= zip(missing, pool.map(lambda i: _load(root, frames[i], files, whole, remover), missing))
         cut_off = [i for i in sorted(read) if touches_border(read[i][1])]
         others = [i for i in usable if i not in cut_off]
-        if len(others) < LEAST_WHOLE or len(others) == len(usable):
+        if len(others) == len(usable) or len(others) < LEAST_WHOLE and len(usable) == len(frames):
             break
-        usable = others
+        usable = others if len(others) >= LEAST_WHOLE else list(range(len(frames)))
     frames, loaded = [frames[i] for i in kept], [read[i] for i in kept]
     notes += choice + [note for frame in frames for note in frame.notes] + _cut_off(names, cut_off, usable)
     notes += [note for *_, found, _ in loaded for note in found]
@@ -209,7 +209,7 @@ def _load(
             f"file_path: expected an image, got {shown(frame.name)} which does not exist; "
             "paths are relative to the camera file and use /",
         )
-    _still_inside(root, path, frame)
+    _still_inside(root, path, frame, "file_path")
     bitmap = decode_image(path, notes=notes, calibrated=frame.lens.size)
     width, height = bitmap.size
     if min(height, width) < MIN_SIDE:
@@ -222,20 +222,25 @@ def _load(
         raise InputError(
             path, f"mask: expected {width} x {height} pixels as the image, got {got}; save it at that size"
         )
+    _not_empty(mask, path)
+    camera = intrinsics_of(frame.lens, width, height, frame.where, notes)
+    part = cut(bitmap.size, above(mask, MASK_EDGE), whole=whole)
+    if part is not None:
+        bitmap, mask, camera = part.pixels(bitmap), part.pixels(mask), part.intrinsics(camera)
+        _not_empty(mask, path)  # isolated pixels vanish in a smaller image
+    image, alpha = color_of(bitmap), unit(mask)
+    if looks_premultiplied(image.numpy(), alpha):
+        notes.append(f"{path.name}: the color looks multiplied by alpha, edges will be dark; save straight alpha")
+    return image, torch.from_numpy(alpha), camera, notes, part is not None
+
+
+def _not_empty(mask: Image.Image, path: Path) -> None:
     if int(above(mask, 0.5).sum()) < MIN_OBJECT:
         raise InputError(
             path,
             "mask: expected the object to be opaque (white), got a mask that is empty; "
             "check that it is neither blank nor inverted",
         )
-    camera = intrinsics_of(frame.lens, width, height, frame.where, notes)
-    part = cut(bitmap.size, above(mask, MASK_EDGE), whole=whole)
-    if part is not None:
-        bitmap, mask, camera = part.pixels(bitmap), part.pixels(mask), part.intrinsics(camera)
-    image, alpha = color_of(bitmap), unit(mask)
-    if looks_premultiplied(image.numpy(), alpha):
-        notes.append(f"{path.name}: the color looks multiplied by alpha, edges will be dark; save straight alpha")
-    return image, torch.from_numpy(alpha), camera, notes, part is not None
 
 
 def looks_premultiplied(image: np.ndarray, mask: np.ndarray) -> bool:
@@ -271,7 +276,7 @@ def _mask(
                 f"mask_path: expected an image, got {shown(found.name)} which does not exist; correct the path",
             )
         if files.given is None:
-            _still_inside(root, found, frame)
+            _still_inside(root, found, frame, "mask")
         return mask_values(found, decode_image(found, notes=notes, calibrated=frame.lens.size), notes)
     if files.given is not None:
         raise InputError(
@@ -303,11 +308,11 @@ def _existing(root: Path, path: Path, index: FolderIndex) -> Path | None:
     return None
 
 
-def _still_inside(root: Path, path: Path, frame: Frame) -> None:
+def _still_inside(root: Path, path: Path, frame: Frame, field: str) -> None:
     if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
         raise InputError(
             frame.where,
-            f"file_path: expected a file within the folder, got {shown(path.name)} which "
+            f"{field}: expected a file within the folder, got {shown(path.name)} which "
             "links out of it; copy the file in",
         )
 

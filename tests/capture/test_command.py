@@ -62,6 +62,9 @@ def test_the_exit_code_is_that_of_the_reconstruction_or_of_its_silhouettes(
         assert argv == [str(tmp_path / "out"), "--output", str(target.parent)]
         target.mkdir(parents=True)
         (target / "run_info.json").write_text(json.dumps({"mask_iou": iou}))
+        other = target.parent / "another"  # of a capture before the folder was renamed
+        other.mkdir()
+        (other / "run_info.json").write_text(json.dumps({"mask_iou": 1.0 - iou}))
         return code
 
     monkeypatch.setattr(function, "capture", lambda *_: report)

@@ -90,7 +90,10 @@ def test_masks_are_found_by_name_before_the_mapping(tmp_path):
     with pytest.raises(InputError, match=r"one mask of 0, got 0\.jpg\.png, 0\.png"):
         capture(photographs, tmp_path / "object", options)
     (masks / "0.jpg.png").unlink()
-    for k in range(1, 8):
+    Image.fromarray(np.repeat([[0], [100], [200]], 3, 1).astype(np.uint8)).resize((320, 240), 0).save(masks / "0.png")
+    with pytest.raises(InputError, match=r"0\.png: .*labels"):
+        capture(photographs, tmp_path / "object", options)
+    for k in range(8):
         Image.new("L", (320, 240)).save(masks / f"{k}.png")  # black: the object is in none of the images
     with pytest.raises(InputError, match="at least 8 of 8, got 0"):
         capture(photographs, tmp_path / "object", options)
@@ -98,11 +101,12 @@ def test_masks_are_found_by_name_before_the_mapping(tmp_path):
 
 
 def test_flash_and_mixed_sizes_are_reported(tmp_path):
-    exif = Image.Exif()
-    exif.get_ifd(ExifTags.IFD.Exif)[BASE.Flash] = 0x19  # fired, auto
-    for k in range(8):
+    # fired: 1 and auto, 0x19; not fired: off, 0x10, and auto, 0x18
+    for k, flash in enumerate([0x01, 0x19, 0x19, 0x10, 0x18, 0x18, 0x00, 0x20]):
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.Exif)[BASE.Flash] = flash
         pixels = textured(k) if k else textured(k, 200, 200)
-        Image.fromarray(pixels).save(tmp_path / f"{k}.jpg", **({"exif": exif} if k < 3 else {}))
+        Image.fromarray(pixels).save(tmp_path / f"{k}.jpg", exif=exif)
     _, notes = read_photos(tmp_path, quiet)
     assert any("3 of 8" in n and "flash: the lighting differs" in n for n in notes)
     assert any("2 image sizes" in n for n in notes) and any("no focal length" in n for n in notes)

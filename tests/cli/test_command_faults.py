@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from reli3d.cli import infer
+from reli3d.cli import infer, render
 from tests.support.processes import heed_signals
 
 # reli3d-infer without torch, which takes seconds to load, and without a network: its one object is {body}
@@ -193,3 +193,6 @@ def test_a_bug_outside_of_the_objects_is_logged_next_to_the_output(tmp_path, mon
     out, err = capsys.readouterr()
     assert out == "" and err.startswith("reli3d-infer: TypeError: ") and err.count("\n") == 1
     assert "Traceback" in (tmp_path / "out.reli3d.log").read_text()
+    monkeypatch.setattr(render, "render_files", lambda *_: 1 + "a")
+    assert render.main(["mesh.glb", "--output", str(tmp_path / "turn.mp4")]) == 1
+    assert "Traceback" in (tmp_path / "turn.mp4.reli3d.log").read_text()

@@ -44,6 +44,9 @@ def place(tmp_path, monkeypatch):
     np.savez(tmp_path / "shape.npz", env=np.ones((8, 4, 4, 3), np.float32), names=names)
     np.savez(tmp_path / "key.npz", maps=np.ones((8, 4, 8, 3), np.float32))
     np.savez(tmp_path / "pickle.npz", env=np.array([{}], dtype=object), names=names)
+    np.save(tmp_path / "array.npy", np.ones((8, 4, 8, 3), np.float32))
+    (tmp_path / "input").mkdir()
+    (tmp_path / "input" / "mesh.glb").write_text("a reference")
     (tmp_path / "cut.npz").write_bytes((tmp_path / "maps.npz").read_bytes()[:300])
     for name, state in (
         ("list", [1]),
@@ -85,6 +88,7 @@ CASES = [
             (["--distance", "inf"], "--distance"),
             (["--diffuse-model", "white"], "arguments: "),
             (["--output", "a.gif", "--format", "png"], "--format: expected gif"),
+            (["--output", "a.jpg"], "--output: expected a folder or a file of type .png"),
             (["--output", "a.mp4", "--size", "47"], "--size: expected an even number"),
         ]
     ),
@@ -105,6 +109,7 @@ CASES = [
             (["--views", "many"], "arguments: "),
         ]
     ),
+    (infer, ["input", "--output", "."], "mesh.glb would be replaced"),
     *(
         (data, ["render", "out", "--maps", *options], word)
         for options, word in [
@@ -128,6 +133,8 @@ CASES = [
             (["maps.npz", "--protocol", "paper", "--views", "8"], "--views: expected none"),
             (["maps.npz", "--protocol", "paper", "--held-out", "test"], "expected at least 3 for --protocol paper"),
             (["maps.npz", "--workers", "2", "--ray", "auto"], "not allowed with"),
+            (["maps.npz", "--meshes", "a.glb", "--shapes", "b.glb"], "not allowed with"),
+            (["array.npy"], "broken file"),
         ]
     ),
     (data, ["render", "file", "--maps", "maps.npz"], "a file"),
@@ -177,6 +184,7 @@ CASES = [
             (["--seed", "-1"], "--seed"),
             (["--validation", "cut"], "broken file"),
             (["--export", "a/b"], "not found"),
+            (["--export", "empty"], "expected a file"),
         ]
     ),
     (train, ["good", "file"], "a file"),

@@ -10,11 +10,13 @@ import torch
 import trimesh
 
 from reli3d.cli.export import main
+from reli3d.fit.transfer import transfer_textures
 from reli3d.geometry.bake import bake
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import read_glb, write_glb
 from reli3d.render.asset import Asset, TextureSet
 from tests.support.meshes import mesh_from
+from tests.support.scenes import textures
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +80,35 @@ def test_vertex_colors_are_baked_where_the_format_has_none_and_notes_are_printed
     got = torch.where(got <= 0.04045, got / 12.92, ((got + 0.055) / 1.055) ** 2.4)
     expected = 0.5 + 0.5 * torch.from_numpy(np.array(shape.vertices)).clamp(-1, 1)
     assert float((got - expected).abs().mean()) < 0.03  # as above
+
+
+def test_colors_without_textures_are_baked_at_a_useful_size(tmp_path, capsys):
+    mesh = mesh_from(trimesh.creation.icosphere(3))
+    mesh = replace(unwrap(mesh, texture_size=64).with_tangents(), colors=None)
+    colors = 0.5 + 0.5 * mesh.vertices.clamp(-1, 1)
+    write_glb(tmp_path / "mesh.glb", Asset(replace(mesh, colors=colors), textures(4, "cpu", (1.0, 1.0, 1.0))))
+    assert main([str(tmp_path / "mesh.glb"), "--format", "obj", "--output", str(tmp_path / "out"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["texture_size"] == 1024
+
+
+def test_textures_are_transferred_within_a_fraction_of_the_size():
+    """Two small squares, the upper one black, 0.1 of the half side apart: the lower one keeps its color."""
+    scale = 0.05
+    square = trimesh.Trimesh([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], [[0, 2, 1], [0, 3, 2]], process=False)
+    upper = square.copy().apply_translation([0, 0.1, 0])
+    both = unwrap(mesh_from(trimesh.util.concatenate([square, upper]).apply_scale(scale)), texture_size=64)
+
+    def at(position, normal, tangent):
+        flat = torch.tensor([0.5, 0.5, 1.0]).expand_as(position)
+        half = torch.full_like(position[:, :1], 0.5)
+        color = (position[:, 1:2] < 0.05 * scale).float().expand(-1, 3)
+        return {"base_color": color, "roughness": half, "metallic": half, "normal": flat}
+
+    both = both.with_tangents()
+    source = Asset(both, TextureSet(**bake(both, 64, at, tangents=True)))
+    lower = transfer_textures(mesh_from(square.copy().apply_scale(scale)), source, 64)
+    uv = ((lower.mesh.uv[lower.mesh.faces.long()].mean(1)) * 64).long()  # centers of the faces
+    assert bool((lower.textures.base_color[uv[:, 1], uv[:, 0]] > 0.9).all())
 
 
 @pytest.mark.parametrize(

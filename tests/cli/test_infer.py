@@ -155,6 +155,18 @@ def test_json_is_one_object_on_stdout(tmp_path, capsys):
     assert (Path(made[0]["folder"]) / "mesh.glb").is_file()
 
 
+def test_the_check_after_a_reconstruction_leaves_its_log_and_reports_nothing_of_it(tmp_path, capsys):
+    result = tmp_path / "out" / "example"
+    result.mkdir(parents=True)
+    (result / "run_info.json").write_text(json.dumps({"mask_iou": 0.5, "mesh": {"faces": 7}, "notes": ["old"]}))
+    log = tmp_path / "out" / "example.reli3d.log"
+    log.write_text("Traceback")
+    assert check.main([str(infer.EXAMPLE), "--json", "--output", str(tmp_path / "out")]) == 0
+    (seen,) = json.loads(capsys.readouterr().out)["objects"]
+    assert seen["mask_iou"] is None and seen["faces"] is None and "old" not in seen["notes"] and seen["seconds"] > 0
+    assert log.read_text() == "Traceback"
+
+
 def test_weights_that_ignore_the_background_refuse_it(tmp_path, capsys):
     assert command(tmp_path, "--background", "visible") == 2
     assert "background: expected masked or auto" in capsys.readouterr().err
@@ -175,9 +187,10 @@ def test_refinement_writes_refine_png_and_its_loss_curve(tmp_path):
     record = info["refinement"]
     stored = load_views(EXAMPLE, every=True)
     given = dict(zip(stored.names, torch.tensor(info["output_from_input"]).double() @ stored.c2w.double(), strict=True))
-    assert list(record["cameras"]) == info["views"]
-    for name, c2w in record["cameras"].items():  # a few steps move them little
-        torch.testing.assert_close(torch.tensor(c2w).double(), given[name], rtol=0, atol=0.05)
+    assert [camera["name"] for camera in record["cameras"]] == info["views"]
+    for camera in record["cameras"]:  # a few steps move them little
+        got = torch.tensor(camera["transform_matrix"]).double()
+        torch.testing.assert_close(got, given[camera["name"]], rtol=0, atol=0.05)
     assert sum(record["steps"].values()) == 6 and record["curve"]
     assert set(record["kept"]) == {"surface", "material", "light"}
     assert record["psnr_after"]["input"] is not None and record["views_held_out"] == [1]

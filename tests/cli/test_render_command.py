@@ -168,6 +168,22 @@ def test_diffuse_model_and_a_missing_light(scene, capsys):
     assert not (scene / "none").exists()
 
 
+def test_planned_sample_counts_are_reported(scene, capsys):
+    common = [
+        str(scene / "ball.glb"),
+        "--output",
+        str(scene / "planned"),
+        "--size",
+        "16",
+        "--light",
+        str(scene / "half.hdr"),
+    ]
+    assert main([*common, "--plan", "16", "--json"]) == 0
+    assert sum(json.loads(capsys.readouterr().out)["samples"]) <= 16
+    assert main([*common, "--plan", "16", "--distance", "1e6"]) == 2
+    assert "--plan: camera: expected the asset in view" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("ending", ["webp", "gif", "mp4"])
 def test_the_name_of_the_output_makes_an_animation(scene, tmp_path, ending):
     """Four frames of a turning light; the first shows the same as a single image."""

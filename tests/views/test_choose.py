@@ -121,6 +121,14 @@ def test_views_that_cut_the_object_off_are_left_out_while_eight_remain(tmp_path)
     assert len(views) == 10 and any(n.startswith(named) and n.endswith("; used all the same") for n in views.notes)
 
 
+def test_of_many_views_that_all_cut_the_object_off_none_is_left_out(tmp_path):
+    cut_off(tmp_path, 40, range(40))
+    views = load_views(tmp_path)
+    assert len(views) == 16 and views.names[0] == "rgba/00.png"
+    assert any(n.endswith("; used all the same") for n in views.notes)
+    assert set(views.names) == set(load_views(tmp_path, every=True).taken().names)
+
+
 def test_of_many_views_those_that_cut_the_object_off_are_replaced(tmp_path):
     cut_off(tmp_path, 24, range(0, 24, 3))
     views = load_views(tmp_path)

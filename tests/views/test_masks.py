@@ -260,6 +260,15 @@ def test_a_mask_path_is_never_that_of_two_images(tmp_path):
         load_views(tmp_path)
 
 
+def test_a_mask_that_links_out_of_the_folder_is_named(tmp_path):
+    folder(tmp_path / "in", ["a.png"])
+    put(tmp_path, ["outside.png"])
+    (tmp_path / "in" / "masks").mkdir()
+    (tmp_path / "in" / "masks" / "a.png").symlink_to(tmp_path / "outside.png")
+    with pytest.raises(InputError, match="mask: expected a file within the folder"):
+        load_views(tmp_path / "in")
+
+
 def test_images_that_differ_in_their_ending_have_a_mask_each(tmp_path):
     folder(tmp_path, ["a.png", "a.jpg"])
     put(tmp_path, ["masks/a.png"])

@@ -97,6 +97,15 @@ def test_exif_orientation_counts_where_the_cameras_were_calibrated_on_turned_ima
     assert float(top_right[:2].max()) < 0.05  # the first stored pixel
 
 
+def test_a_large_mask_of_isolated_pixels_is_empty(tmp_path):
+    folder = capture(tmp_path / "large", 6000, 4000, (1500, 800, 4500, 3200))
+    specks = np.zeros((4000, 6000), np.uint8)
+    specks[200:3800:200, 300:5700:300] = 255
+    Image.fromarray(specks).save(folder / "masks/a.png")
+    with pytest.raises(InputError, match="mask that is empty"):
+        load_views(folder)
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the peak of a process is read from Linux' /proc")
 def test_16_large_photographs_take_less_than_a_gibibyte(tmp_path):
     """Peak of a process that reads 16 photographs of 24 megapixels, and their masks."""
