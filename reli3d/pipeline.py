@@ -488,9 +488,9 @@ def reconstruct_folder(
     model: Network,
     weights: Mapping[str, Any],
     *,
-    reading: FolderOptions = FolderOptions(),  # noqa: B008 # it is frozen
-    options: ReconstructOptions = DEFAULT,
-    progress: Progress | None = None,
+    reading: FolderOptions,
+    options: ReconstructOptions,
+    progress: Progress,
 ) -> None:
     """Reconstructs the object of ``folder``, refines it if ``reading`` has a budget, and writes the result.
 
@@ -501,7 +501,6 @@ def reconstruct_folder(
     from reli3d.output import results
     from reli3d.output.preview import comparison, preview
 
-    progress = progress or Progress()
     watch = Stopwatch(model.device, progress)
     with watch.stage("reading"):
         whole = published_input(model.preset) or (_reads_background(model) and options.background != "masked")

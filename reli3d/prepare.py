@@ -37,7 +37,7 @@ class Prepared:
         c2w, intrinsics = (torch.cat([getattr(batch, name), getattr(flipped, name)]) for name in ("c2w", "intrinsics"))
         camera, other = self.camera, plane.mirrored(self.camera)
         camera = Camera(c2w, torch.cat([camera.intrinsics, other.intrinsics]), camera.width, camera.height)
-        return Prepared(ViewBatch(parts[0], parts[1], c2w, intrinsics, 2 * batch.names), parts[2], camera, len(batch))
+        return Prepared(ViewBatch(parts[0], parts[1], c2w, intrinsics), parts[2], camera, len(batch))
 
 
 @full_precision

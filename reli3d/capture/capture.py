@@ -17,7 +17,7 @@ from PIL import Image
 from reli3d.capture.fusion import fused_masks
 from reli3d.capture.mapping import Map, View, map_photos
 from reli3d.capture.masks import grabcut_mask, is_empty, key_mask, moving_region, touches_border
-from reli3d.capture.photos import FEWEST, PHOTO_SUFFIXES, Photo, Progress, read_photos
+from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
 from reli3d.capture.rigidity import Frame, Group, epipolar_fit, inside_mask, rigid_groups
 from reli3d.capture.scene import Scene, find_scene
 from reli3d.capture.sheet import contact_sheet
@@ -29,6 +29,7 @@ from reli3d.views.check import agreement
 from reli3d.views.choose import choose_views
 from reli3d.views.file_names import images_in
 from reli3d.views.masks import mask_values
+from reli3d.views.missing_cameras import PHOTOGRAPHS
 from reli3d.views.views import Views
 
 RESULT_FILES = ("images", "masks", "transforms.json", "capture.json", "capture.png")
@@ -212,9 +213,7 @@ def _given_mask(folder: Path, photo: Photo) -> np.ndarray | None:
     files = []
     for path in images_in(folder):
         before = Path(path.stem)
-        if photo.name in (path.name, path.stem) or (
-            before.suffix.lower() in PHOTO_SUFFIXES and photo.name == before.stem
-        ):
+        if photo.name in (path.name, path.stem) or (before.suffix.lower() in PHOTOGRAPHS and photo.name == before.stem):
             files.append(path)
     if not files:
         return None

@@ -14,14 +14,13 @@ from PIL import ExifTags, Image, ImageOps
 
 from reli3d.errors import InputError, shown
 from reli3d.io.files import file_size
+from reli3d.views.missing_cameras import PHOTOGRAPHS, VIDEOS
 
 LONGEST_SIDE = 2000  # pixels of a photograph that is kept
 FRAME_COUNT = 60  # frames taken from a video
 MOST_PHOTOS = 120  # of a folder: of more every second, third, ... is read
 FEWEST = 8  # photographs, below which no closed shape can be expected
 MAX_PIXELS = 1 << 27
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".webp", ".tif", ".tiff")
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 WHOLE_VIDEO = 0.9  # fraction of the frames that a file announces, below which it is cut off
 SHARPNESS_SIDE = 640  # pixels at which sharpness is compared
 MILLIMETERS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
@@ -53,7 +52,7 @@ def read_photos(source: Path, progress: Progress) -> tuple[list[Photo], list[str
     """
     if source.is_dir():
         photos, notes = _read_folder(source, progress)
-    elif source.suffix.lower() in VIDEO_SUFFIXES:
+    elif source.suffix.lower() in VIDEOS:
         photos, notes = _read_video(source, progress)
     else:
         file_size(source)
@@ -77,7 +76,7 @@ def read_photos(source: Path, progress: Progress) -> tuple[list[Photo], list[str
 
 
 def _read_folder(folder: Path, progress: Progress) -> tuple[list[Photo], list[str]]:
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith("."))
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTOGRAPHS and not p.name.startswith("."))
     if not files and (folder / "images").is_dir():
         return _read_folder(folder / "images", progress)
     if any(p.suffix.lower() in (".heic", ".heif") for p in files):

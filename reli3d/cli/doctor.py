@@ -7,7 +7,7 @@ import platform
 import re
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -122,9 +122,5 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON object with the rows by name and usable")
     args = parser.parse_args(argv)
     rows, usable = examine()
-    print(json.dumps({**dict(rows), "usable": usable}) if args.json else aligned(rows))
+    print(json.dumps({**dict(rows), "usable": usable}) if args.json else "\n".join(f"{n:16s} {v}" for n, v in rows))
     return 0 if usable else 1
-
-
-def aligned(rows: Sequence[tuple[str, str]]) -> str:
-    return "\n".join(f"{name:16s} {value}" for name, value in rows)

@@ -1,10 +1,9 @@
 """``reli3d-tables``: the tables of the ReLi3D paper on a folder of textured GLB files."""
 
 import argparse
-import sys
 from pathlib import Path
 
-from reli3d.cli.exit_codes import Parser, check_range, command
+from reli3d.cli.exit_codes import Parser, check_range, command, report
 from reli3d.errors import InputError
 
 MAX_VIEWS = 16  # input views
@@ -48,7 +47,6 @@ def main(argv: list[str] | None = None) -> int:
     if len(lights) < 2:
         raise InputError("--maps", "expected at least two held-out maps, got fewer; give twelve maps or more")
     model = load_model(args.weights)
-    report = lambda line: print(line, file=sys.stderr)  # noqa: E731
     tables, rows, sheet = table(
         model, args.objects, lights, args.views, size=args.size, seed=args.seed, progress=report
     )

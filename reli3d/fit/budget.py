@@ -59,10 +59,7 @@ class Budget:
                 if now >= self.seconds * until:
                     return
                 progress = (now - started) / (self.seconds * until - started)
-            try:
-                yield count, progress
-            except GeneratorExit:
-                return
+            yield count, progress
             count += 1
             self.counts[name] = count
 

@@ -42,11 +42,6 @@ class Weights:
     bend: float = 20.0  # of the squared bend that is kept; divided by the squared number of views
 
 
-def display_derivative(target: Tensor) -> Tensor:
-    """Derivative of the display curve x^(1/2.2) at linear ``target``, constant below ``MIN_LINEAR``."""
-    return (1.0 / 2.2) * target.clamp(min=MIN_LINEAR) ** (1.0 / 2.2 - 1.0)
-
-
 def display_error(image: Tensor, other: Tensor, target: Tensor, bright: Tensor) -> Tensor:
     """Huber loss of ``image (N, 3)`` in display values, mean over all; unbiased value and gradient of noisy images.
 
@@ -58,7 +53,7 @@ def display_error(image: Tensor, other: Tensor, target: Tensor, bright: Tensor) 
     target: ``(N, 3)`` linear radiance of the input images.  bright: ``(N, 3)`` bool, saturated values of ``target``,
     where only a negative residual counts.
     """
-    derivative = display_derivative(target)
+    derivative = (1.0 / 2.2) * target.clamp(min=MIN_LINEAR) ** (1.0 / 2.2 - 1.0)  # of x^(1/2.2)
     residual = ((other - target) * derivative).detach()
     residual = torch.where(bright, residual.clamp(max=0.0), residual)
     full, residual = residual, residual * (HUBER_DELTA / residual.abs().clamp(min=HUBER_DELTA))
@@ -84,11 +79,6 @@ def agreement(color: Tensor, weight: Tensor) -> Tensor:
     variance = AGREEMENT_SIGMA**2
     robust = variance * (1.0 - torch.exp(-square / (2.0 * variance)))  # bounded: outliers have no gradient
     return ((weight * robust).sum(1) * valid).sum() / valid.sum().clamp(min=1) / variance
-
-
-def outline(cover: Tensor, mask: Tensor) -> Tensor:
-    """Mean absolute difference between antialiased coverage and mask."""
-    return (cover - mask).abs().mean()
 
 
 def curvature(sdf: Tensor, cell: float, weight: Tensor) -> Tensor:

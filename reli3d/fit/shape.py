@@ -217,7 +217,7 @@ def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, 
         camera = corrected(small.camera[view], unknowns.pose[view])
         cover = (primary_hits(scene, camera.detach())[0].face >= 0).float()[..., None]
         cover = antialias(cover, mesh.vertices, mesh.faces, camera, scene, edges=edges)[..., 0]
-        total = total + losses.outline(cover, small.mask[view])
+        total = total + (cover - small.mask[view]).abs().mean()
     return total / len(chosen)
 
 

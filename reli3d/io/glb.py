@@ -67,6 +67,13 @@ def portable(asset: Asset) -> bool:
     return asset.mesh.colors is None and (inside or asset.textures.wrap == ("repeat", "repeat"))
 
 
+def check_portable(asset: Asset) -> None:
+    """:func:`check_asset` for OBJ and USD; also raises ValueError unless ``asset`` is :func:`portable`."""
+    check_asset(asset)
+    if not portable(asset):
+        raise ValueError("asset: expected no mesh.colors, and uv in [0, 1] or textures.wrap repeat; bake it anew")
+
+
 def check_asset(asset: Asset) -> None:
     """Raises TypeError or ValueError for an asset with missing attributes or with values out of range or non-finite."""
     expect("asset", asset, Asset)

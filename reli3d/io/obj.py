@@ -10,7 +10,7 @@ import io
 import numpy as np
 
 from reli3d._bridge import present
-from reli3d.io.glb import check_asset, encode_image, portable
+from reli3d.io.glb import check_portable, encode_image
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 
@@ -31,9 +31,7 @@ def obj_files(asset: Asset, name: str) -> dict[str, bytes]:
     Raises TypeError or ValueError as :func:`reli3d.write_glb`, and ValueError for vertex colors or UV outside [0, 1]
     that do not repeat.
     """
-    check_asset(asset)
-    if not portable(asset):
-        raise ValueError("asset: expected no mesh.colors, and uv in [0, 1] or textures.wrap repeat; bake it anew")
+    check_portable(asset)
     mesh, textures = asset.mesh, asset.textures
     text = io.StringIO()
     text.write(f"mtllib {name}.mtl\no object\n")

@@ -7,7 +7,7 @@ import numpy as np
 
 from reli3d._bridge import present
 from reli3d.geometry.mesh import watertight
-from reli3d.io.glb import addressing, check_asset, portable, texture_images
+from reli3d.io.glb import addressing, check_portable, texture_images
 from reli3d.render.asset import Asset
 
 
@@ -16,9 +16,7 @@ def usdz_bytes(asset: Asset) -> bytes:
 
     Roughness and metallic are channels of one texture, as in glTF; texture coordinates have v up, as in USD.
     """
-    check_asset(asset)
-    if not portable(asset):
-        raise ValueError("asset: expected no mesh.colors, and uv in [0, 1] or textures.wrap repeat; bake it anew")
+    check_portable(asset)
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
     except ModuleNotFoundError as error:

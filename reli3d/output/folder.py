@@ -68,7 +68,7 @@ def claimed(folder: Path, ours: Collection[str]) -> Iterator[Callable]:
     folder = check_place(folder)
     made = [p for p in folder.parents if not p.exists()]
     folder.parent.mkdir(parents=True, exist_ok=True)
-    work = _work(folder)
+    work = sibling(folder, ".", PARTIAL)
     try:
         lock = _locked(work, folder)
         try:
@@ -140,10 +140,6 @@ def sibling(path: Path, before: str, after: str) -> Path:
     if len(os.fsencode(name)) > LONGEST:
         name = f"{before}{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:32]}{after}"
     return path.with_name(name)
-
-
-def _work(folder: Path) -> Path:
-    return sibling(folder, ".", PARTIAL)
 
 
 def _locked(work: Path, folder: Path) -> int:

@@ -106,10 +106,12 @@ def load_views(
         notes.append(f"{reduced} of {len(loaded)} photographs have more than {MAX_FULL_PIXELS} pixels: {part}")
     if remover and remover.masks:
         notes.append(f"{remover.masks} of {len(loaded)} masks made by rembg ({remover.network})")
+    poses, box = np.stack([f.c2w for f in frames]), frames[0].object_box
+    poses[:, :3, 3] -= origin
     return Views(
         images=tuple(image for image, *_ in loaded),
         masks=tuple(mask for _, mask, *_ in loaded),
-        c2w=_poses(frames, origin),
+        c2w=torch.from_numpy(poses.astype(np.float32)),
         intrinsics=torch.tensor([k for _, _, k, *_ in loaded], dtype=torch.float32, device="cpu"),
         names=tuple(f.name for f in frames),
         notes=tuple(dict.fromkeys(notes)),
@@ -117,7 +119,7 @@ def load_views(
         chosen=tuple(taken) if every else None,
         origin=origin,
         lighting=frames[0].lighting,
-        object_box=_moved_box(frames[0].object_box, origin),
+        object_box=box and tuple(tuple(a - b for a, b in zip(corner, origin)) for corner in box),
     )
 
 
@@ -161,16 +163,6 @@ def _origin(frames: list[Frame], folder) -> tuple[tuple[float, float, float], li
         raise InputError(folder, str(error)) from None
     place = ", ".join(f"{v:.6g}" for v in at)
     return at, [f"the cameras are far from their origin: work is done about ({place})"] if any(at) else []
-
-
-def _moved_box(box: tuple | None, origin: tuple[float, float, float]) -> tuple[tuple[float, ...], ...] | None:
-    return box and tuple(tuple(a - b for a, b in zip(corner, origin)) for corner in box)
-
-
-def _poses(frames: list[Frame], origin: tuple[float, float, float]) -> Tensor:
-    poses = np.stack([f.c2w for f in frames])
-    poses[:, :3, 3] -= origin
-    return torch.from_numpy(poses.astype(np.float32))
 
 
 def _chosen(frames: list[Frame], usable: list[int], views: int | None) -> tuple[list[int], list[str]]:

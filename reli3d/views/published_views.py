@@ -45,7 +45,7 @@ def published_views(views: Views, size: int) -> ViewBatch:
         height, width = mask.shape
         intrinsics.append(camera * camera.new_tensor([size / width, size / height] * 2))
     cameras = torch.stack(intrinsics).to(views.intrinsics.dtype)
-    return ViewBatch(torch.stack(images), torch.stack(masks), views.c2w, cameras, views.names)
+    return ViewBatch(torch.stack(images), torch.stack(masks), views.c2w, cameras)
 
 
 def jpeg_round_trip(pixels: Tensor) -> Tensor:

@@ -21,13 +21,12 @@ MASK_EDGE = 0.1  # alpha from which a pixel counts into the bounding box: keeps 
 
 @dataclass(frozen=True)
 class ViewBatch(Movable):
-    """Views resampled to one size: ``images (V, S, S, 3)``, ``masks (V, S, S)``, their cameras and names."""
+    """Views resampled to one size: ``images (V, S, S, 3)``, ``masks (V, S, S)``, and their cameras."""
 
     images: Tensor
     masks: Tensor
     c2w: Tensor  # (V, 4, 4)
     intrinsics: Tensor  # (V, 4) of the resampled images
-    names: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return self.images.shape[0]
@@ -140,7 +139,7 @@ class Views(Movable):
             origin = camera.new_tensor([x, y])
             intrinsics.append(torch.cat([camera[:2] * scale, (camera[2:] - origin) * scale]))
         cameras = torch.stack(intrinsics).to(self.intrinsics.dtype)
-        return ViewBatch(images, masks, self.c2w, cameras, self.names)
+        return ViewBatch(images, masks, self.c2w, cameras)
 
 
 def mask_box(mask: Tensor) -> tuple[int, int, int, int]:
