@@ -44,7 +44,7 @@ def interpolate(values: Tensor, faces: Tensor, face: Tensor, bary: Tensor) -> Te
     if values.ndim != 2 or values.shape[1] not in kernels.INTERPOLATE:
         raise ValueError(f"values: expected shape (V, C) with C = 2, 3 or 4, got {tuple(values.shape)}")
     _check_faces(values.shape[0], faces, face, values)
-    check("bary", bary, last=2, like=values)
+    check("bary", bary, shape=(*face.shape, 2), like=values)
     n = face.numel()
     ins = [values, faces, face.reshape(-1), bary.reshape(-1, 2)]
     (out,) = call(kernels.INTERPOLATE[values.shape[1]], n, ins, [(n,)], shared=(0,))

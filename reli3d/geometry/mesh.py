@@ -16,6 +16,7 @@ from reli3d.geometry.tangents import vertex_tangents
 from reli3d.geometry.topology import edges_of, graph_components, weld_rows
 
 NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below which it counts as zero (ReLi3D release)
+RELATIVE_NORMAL_MIN = 1.0e-12  # the same relative to the largest sum, which is the limit for small meshes
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,8 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     for corner in faces.long().T.contiguous():  # index_add is about 10 times slower with int32
         total = total.index_add(0, corner, per_face)
     square = (total * total).sum(-1, keepdim=True)
-    valid = square > NORMAL_MIN
+    least = (RELATIVE_NORMAL_MIN * square.detach().amax(0)).clamp(max=NORMAL_MIN) if len(square) else NORMAL_MIN
+    valid = square > least
     unit = total * torch.rsqrt(torch.where(valid, square, 1.0))
     return torch.where(valid, unit, unit.new_tensor([0.0, 0.0, 1.0]))
 

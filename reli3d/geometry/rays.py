@@ -104,8 +104,12 @@ class RayScene:
         """
         if vertices is None:
             vertices = self.vertices
-        elif vertices.shape != self.vertices.shape or not torch.equal(vertices.detach(), self.vertices):
-            raise ValueError("vertices: expected the positions of the scene, got others; call refit(vertices) first")
+        else:
+            check("vertices", vertices, like=self.faces)
+            if vertices.shape != self.vertices.shape or not torch.equal(vertices.detach(), self.vertices):
+                raise ValueError(
+                    "vertices: expected the positions of the scene, got others; call refit(vertices) first"
+                )
         hits = self.closest(origins, directions, t_max=t_max)
         origins, directions = tensor_of(origins), tensor_of(directions)
         return evaluate_hits(vertices, self.faces, hits, origins, directions)

@@ -28,7 +28,8 @@ def sparse_sdf(known: Tensor, near: Tensor, evaluate: Callable[[Tensor], Tensor]
         )
     if near.dtype != torch.bool:
         raise TypeError(f"near: expected torch.bool, got {near.dtype}")
-    sdf, done = known.clone(), torch.zeros_like(near)
+    sdf, near = known.clone(memory_format=torch.contiguous_format), near.contiguous()
+    done = torch.zeros_like(near)
 
     def evaluate_at(active: Tensor) -> None:
         index = active.view(-1).nonzero()[:, 0]

@@ -102,7 +102,7 @@ def surface_points(sdf: Tensor, cubes: Tensor) -> tuple[Tensor, Tensor]:
     i, rest = cubes // ((y - 1) * (z - 1)), cubes % ((y - 1) * (z - 1))
     lowest = (i * y + rest // (z - 1)) * z + rest % (z - 1)
     corners = lowest[:, None] + ((k & 1) * y + (k >> 1 & 1)) * z + (k >> 2)
-    needed = torch.zeros_like(sdf, dtype=torch.bool)
+    needed = torch.zeros_like(sdf, dtype=torch.bool, memory_format=torch.contiguous_format)
     for side in range(3):  # where the inside reaches the box, the cap uses the vertices of the border
         for end in (0, -1):
             needed.select(side, end)[sdf.select(side, end) < 0] = True

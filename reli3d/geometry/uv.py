@@ -203,6 +203,8 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
             (extent * best + guard).prod(1).sum() < MAX_GUARD_RATIO * (extent * best).prod(1).sum() or guard < 0.1
         ):
             break
+        if not best and guard < 0.1:
+            raise ValueError(f"texture_size: expected more texels for the {count} charts of the mesh, got {size}")
         guard *= 0.5  # too many charts: the guard band would take most of the atlas
     inside = corners * best + 0.5 * guard
     width = np.ceil((extent[:, 0] * best + guard) / cell)

@@ -34,7 +34,7 @@ def visible_from(
     distance = position.new_empty(count)
     arrays = [v.detach().contiguous() for v in (position, normal, camera.c2w, camera.intrinsics, pair)]
     size = wp.vec2(float(camera.width), float(camera.height))
-    launch(sight_kernel, count, [*arrays, size, MIN_COSINE, origin, direction, distance], position.device)
+    launch(sight_kernel, count, [*arrays, size, MIN_COSINE, scene.scale, origin, direction, distance], position.device)
     free = scene.unoccluded(origin, direction, distance)
     if active is not None:
         free = active.T.clone(memory_format=torch.contiguous_format).masked_scatter_(active.T, free)

@@ -82,8 +82,8 @@ def residual_kernel(
         direction = wp.normalize(wp.transform_vector(pose, wp.vec3((x - k[2]) / k[0], (k[3] - y) / k[1], -1.0)))
         size = wp.vec3(float(sdf.shape[0] - 1), float(sdf.shape[1] - 1), float(sdf.shape[2] - 1))
         scale = size * (0.5 / radius)  # cells per unit length
-        step = STEP_CELLS / wp.max(wp.max(scale[0], scale[1]), scale[2])
         span = cube_range(origin, direction, radius, 0.0, 3.0e38)
+        step = wp.max(STEP_CELLS / wp.max(wp.max(scale[0], scale[1]), scale[2]), 1.0e-6 * span[1])  # of float32
         t = span[0]
         least = wp.float32(field_max)
         while t < span[1] and least > -depth:

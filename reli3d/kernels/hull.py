@@ -20,6 +20,7 @@ REACHED = wp.constant(1.0e-3)  # world units: a ray this close to the hull has h
 STEP_FACTOR = wp.constant(0.7)  # of sphere tracing, because distances are up to 1 / cos^2 of an angle too long
 STEP_MIN = wp.constant(4.0e-3)  # world units: thinner parts of the hull may be missed
 STEP_MAX = wp.constant(0.25)
+LEAST_STEP = wp.constant(1.0e-6)  # of the distance from the camera: smaller steps are lost in float32
 DEPTH_MIN = wp.constant(1.0e-4)  # world units: points closer to a camera's plane count as behind it
 EXACT_PIXELS = wp.constant(4.0)  # beyond, other segments are at most sqrt(16.5) - 4 = 0.06 pixels nearer
 SEGMENT_PIXELS = wp.constant(16.0)  # beyond, the end of a segment is at most 0.25 / 16 pixels farther than the segment
@@ -131,7 +132,7 @@ def hull_span_kernel(
         if h >= -REACHED:
             inside = True
         else:
-            first += wp.clamp(-h * STEP_FACTOR, STEP_MIN, STEP_MAX) * unit
+            first += wp.max(wp.clamp(-h * STEP_FACTOR, STEP_MIN, STEP_MAX) * unit, LEAST_STEP * high)
     if not inside:
         span[i] = wp.vec2(nearest, nearest)
         return
@@ -142,7 +143,7 @@ def hull_span_kernel(
         if h >= -REACHED:
             inside = True
         else:
-            last -= wp.clamp(-h * STEP_FACTOR, STEP_MIN, STEP_MAX) * unit
+            last -= wp.max(wp.clamp(-h * STEP_FACTOR, STEP_MIN, STEP_MAX) * unit, LEAST_STEP * high)
     span[i] = wp.vec2(first, wp.max(first, last))
 
 

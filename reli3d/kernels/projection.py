@@ -9,7 +9,7 @@ from reli3d.kernels.bilinear import between_pixels, blend
 
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
 
-DEPTH_MIN = wp.constant(1.0e-3)  # a point closer than this to the camera plane is treated as being on it
+DEPTH_MIN = wp.constant(1.0e-9)  # a point closer than this to the camera plane is treated as being on it
 
 
 @wp.func

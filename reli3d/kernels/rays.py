@@ -97,6 +97,7 @@ def sight_kernel(
     pair: wp.array[wp.int32],
     size: wp.vec2,
     grazing: float,
+    scale: float,
     origin: wp.array[wp.vec3],  # out
     direction: wp.array[wp.vec3],  # out
     t_max: wp.array[float],  # out
@@ -123,4 +124,4 @@ def sight_kernel(
     if wp.dot(toward, n) > grazing and q[2] > 0.0 and q[0] > 0.0 and q[0] < size[0] and q[1] > 0.0 and q[1] < size[1]:
         t_max[i] = distance
     direction[i] = toward
-    origin[i] = offset_origin(p, n, toward, 1.0)
+    origin[i] = offset_origin(p, n, toward, scale)

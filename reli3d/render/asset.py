@@ -83,7 +83,9 @@ class TextureSet(Movable):
         Cached for gradient-free maps of at most ``KEPT`` texels per side until they are modified.
         """
         sources = self.roughness, self.metallic
-        changing = any(s.is_inference() or (s.requires_grad and torch.is_grad_enabled()) for s in sources)
+        changing = torch.is_inference_mode_enabled() or any(
+            s.is_inference() or (s.requires_grad and torch.is_grad_enabled()) for s in sources
+        )
         lasting = self.size <= KEPT and not changing
         written = tuple(s._version for s in sources) if lasting else None
         kept, values = vars(self).get("_rough_metal", (None, None))

@@ -115,9 +115,10 @@ class Environment(Movable):
 
     def resized(self, height: int) -> "Environment":
         """The environment at ``height`` x 2 ``height`` texels: area-averaged when reduced, bilinear when enlarged."""
+        if height > self.radiance.shape[0]:
+            return Environment(self.lookup(lat_long_directions(height, device=self.radiance.device)))
         planes = self.radiance.permute(2, 0, 1)[None]
-        mode = "area" if height <= self.radiance.shape[0] else "bilinear"
-        out = torch.nn.functional.interpolate(planes, size=(height, 2 * height), mode=mode)
+        out = torch.nn.functional.interpolate(planes, size=(height, 2 * height), mode="area")
         return Environment(out[0].permute(1, 2, 0).contiguous())
 
     @cached_property

@@ -13,22 +13,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import call, check, empty, launch
+from reli3d._bridge import call, empty, launch
 from reli3d.kernels import bsdf as kernels
-from reli3d.render.sampling import mirror, reflect, sample_cosine, sample_ggx_vndf
+from reli3d.render.sampling import flattened, mirror, reflect, sample_cosine, sample_ggx_vndf
 
 DIFFUSE_MODELS = ("conserving", "published")  # energy transmitted to the diffuse layer: reli3d.kernels.bsdf
 LOBES = ("visible", "mirrored", "cosine")  # in the order of the kernel's columns
-
-
-def _flat(items: list[tuple[str, Tensor, int]]) -> tuple[torch.Size, list[Tensor]]:
-    """Checked and broadcast operands, flattened to ``(N, k)`` or ``(N,)``; ``items`` hold name, value and last axis."""
-    first = items[0][1]
-    for name, value, last in items:
-        check(name, value, last=last or None, like=first)
-    batch = torch.broadcast_shapes(*(v.shape[:-1] if last else v.shape for _, v, last in items))
-    flat = [v.expand(*batch, last).reshape(-1, last) if last else v.expand(batch).reshape(-1) for _, v, last in items]
-    return batch, flat
 
 
 def choice(name: str, value: str, allowed: tuple[str, ...]) -> int:
@@ -55,7 +45,7 @@ def eval_bsdf(
     >>> value = reli3d.eval_bsdf(up, torch.full((3,), 0.8), half, half, up)
     """
     conserving = int(choice("diffuse_model", diffuse_model, DIFFUSE_MODELS) == 0)
-    batch, flat = _flat(
+    batch, flat = flattened(
         [("wo", wo, 3), ("wi", wi, 3), ("base_color", base_color, 3), ("alpha", alpha, 0), ("metallic", metallic, 0)]
     )
     n = flat[0].shape[0]
@@ -105,7 +95,7 @@ def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") ->
 
 def pdf_lobes(wo: Tensor, alpha: Tensor, wi: Tensor) -> Tensor:
     """:func:`pdf_bsdf` for each of :data:`LOBES`, ``(..., 3)``."""
-    batch, flat = _flat([("wo", wo, 3), ("wi", wi, 3), ("alpha", alpha, 0)])
+    batch, flat = flattened([("wo", wo, 3), ("wi", wi, 3), ("alpha", alpha, 0)])
     ins = [t.detach().contiguous() for t in flat]
     out = empty((flat[0].shape[0],), wp.vec3, wo.device)
     launch(kernels.pdf_lobes_kernel, out.shape[0], [*ins, out], wo.device)

@@ -21,6 +21,24 @@ def sample_cosine(u: Tensor) -> Tensor:
     return torch.stack([radius * angle.cos(), radius * angle.sin(), (1.0 - square).sqrt()], -1)
 
 
+def flattened(items: list[tuple[str, Tensor, int]]) -> tuple[torch.Size, list[Tensor]]:
+    """Checked and broadcast operands, flattened to ``(N, k)`` or ``(N,)``; ``items`` hold name, value and last axis.
+
+    Raises TypeError unless float32, ValueError for a wrong shape or device and for shapes that do not broadcast.
+    """
+    first = items[0][1]
+    for name, value, last in items:
+        check(name, value, last=last or None, like=first)
+    shapes = [tuple(v.shape[:-1] if last else v.shape) for _, v, last in items]
+    try:
+        batch = torch.broadcast_shapes(*shapes)
+    except RuntimeError:
+        names, got = (", ".join(map(str, part)) for part in ([name for name, _, _ in items], shapes))
+        raise ValueError(f"{names}: expected shapes that broadcast, got {got}") from None
+    flat = [v.expand(*batch, last).reshape(-1, last) if last else v.expand(batch).reshape(-1) for _, v, last in items]
+    return batch, flat
+
+
 def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
     """Samples unit GGX microfacet normals ``(..., 3)`` visible from ``wo``, local frame (+z is the surface normal).
 
@@ -32,15 +50,7 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
     >>> wo, alpha = torch.tensor([0.6, 0.0, 0.8]), torch.tensor(0.25)
     >>> wm = reli3d.sample_ggx_vndf(wo, alpha, torch.rand(4096, 2))
     """
-    check("wo", wo, last=3)
-    check("alpha", alpha, like=wo)
-    check("u", u, last=2, like=wo)
-    batch = torch.broadcast_shapes(wo.shape[:-1], alpha.shape, u.shape[:-1])
-    ins = [
-        wo.expand(*batch, 3).reshape(-1, 3),
-        alpha.expand(batch).reshape(-1),
-        u.detach().expand(*batch, 2).reshape(-1, 2),
-    ]
+    batch, ins = flattened([("wo", wo, 3), ("alpha", alpha, 0), ("u", u.detach(), 2)])
     n = batch.numel()
     (wm,) = call(microfacet.sample_ggx_vndf_kernel, n, ins, [(n,)])
     return wm.reshape(*batch, 3)
@@ -57,11 +67,7 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
     >>> wm = reli3d.sample_ggx_vndf(wo, alpha, u)
     >>> density = reli3d.pdf_ggx_vndf(wo, alpha, wm)
     """
-    check("wo", wo, last=3)
-    check("alpha", alpha, like=wo)
-    check("wm", wm, last=3, like=wo)
-    batch = torch.broadcast_shapes(wo.shape[:-1], alpha.shape, wm.shape[:-1])
-    ins = [wo.expand(*batch, 3).reshape(-1, 3), alpha.expand(batch).reshape(-1), wm.expand(*batch, 3).reshape(-1, 3)]
+    batch, ins = flattened([("wo", wo, 3), ("alpha", alpha, 0), ("wm", wm, 3)])
     n = batch.numel()
     (pdf,) = call(microfacet.pdf_ggx_vndf_kernel, n, ins, [(n,)])
     return pdf.reshape(batch)

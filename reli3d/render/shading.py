@@ -90,6 +90,7 @@ class ShadeOptions:
         expect("samples", self.samples, Sequence)
         if len(self.samples) != 3 or any(int(k) != k or k < 0 for k in self.samples):
             raise ValueError(f"samples: expected three counts of at least 0, got {tuple(self.samples)}")
+        object.__setattr__(self, "samples", Samples(*map(int, self.samples)))
         expect("seed", self.seed, Integral)
         for name, allowed in CHOICES.items():
             choice(name, getattr(self, name), allowed)

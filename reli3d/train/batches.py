@@ -46,7 +46,7 @@ def finish_known(file: safe_open) -> Tensor:
     """``(V,)`` bool of an open sample; of one that does not store it, all true."""
     if "finish_known" in file.keys():  # noqa: SIM118 - no iterable
         return file.get_tensor("finish_known").bool()
-    return torch.ones(file.get_slice("c2w").get_shape()[0], dtype=torch.bool)
+    return torch.ones_like(file.get_tensor("c2w")[:, 0, 0], dtype=torch.bool)
 
 
 @dataclass(frozen=True)

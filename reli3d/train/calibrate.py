@@ -93,7 +93,7 @@ def view_scores(mesh: Mesh, sample: dict[str, Tensor], views: range) -> tuple[fl
     """Mean silhouette IoU and mean :func:`normal_map_error` of ``mesh`` in ``views`` of ``sample``."""
     scene, size = RayScene(mesh.vertices, mesh.faces), sample["images"].shape[1]
     normals = present("mesh.normals", mesh.normals)
-    step = size // COMPARED_SIZE
+    step = max(1, size // COMPARED_SIZE)
     rows = []
     for v in views:
         intrinsics = sample["intrinsics"][v] / step

@@ -134,7 +134,8 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
         bar.set_description(f"{stage.name}, step {step}", refresh=False)
         bar.update(100 * progress(options, step, seconds) - bar.n)
         last = progress(options, step, seconds) >= 1.0
-        if step % options.log_every == 0 or last:
+        saving = step % options.save_every == 0 or last
+        if step % options.log_every == 0 or saving:
             row = {"step": step, "seconds": round(seconds), **row_of(stage, sums)}
             row |= {"rate": rate, "norm": round(float(norm), 5), "bad": bad}
             sums = torch.zeros_like(sums)
@@ -142,7 +143,7 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
                 log.write(row)
             if board:
                 board.numbers(row)
-        if step % options.save_every == 0 or last:
+        if saving:
             measures = stage.measures()
             if log:
                 checkpoint.save(folder, stage, optimizer, average, step, seconds, about, measures)

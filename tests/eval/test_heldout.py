@@ -5,7 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import trimesh
 
+from reli3d.errors import InputError
 from reli3d.eval import heldout
 from reli3d.eval.heldout import evaluate, light_error, mean_environment, scaled_square_error, square_error, summary
 from reli3d.eval.heldout import table as table_of
@@ -17,6 +19,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions
 from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.samples import ObjectSurface, synthesize
+from tests.support.meshes import mesh_from
 
 
 def test_a_factor_a_channel_is_forgiven_and_a_pattern_is_not():
@@ -67,6 +70,17 @@ def test_an_empty_field_counts_as_nothing_found_and_spoils_no_mean(monkeypatch):
     row = evaluate(None, sample, seed, 4, torch.ones(32, 64, 3))
     assert torch.equal(torch.stack([c.c2w for c in looked]), sample["c2w"][-8:])  # none of the views that are input
     assert (row["empty"], row["iou"]) == (0.0, 0.0) and not any(key.endswith("mse") for key in row)
+
+
+def test_a_sample_of_another_object_is_refused(monkeypatch):
+    seed, light = 1_000_000_002, torch.ones(32, 64, 3)
+    other = synthesize(ObjectSurface(make_object(seed + 1)), light, np.random.default_rng(0), size=48, views=9)
+    mesh = mesh_from(trimesh.creation.icosphere(1))
+    maps = SimpleNamespace(mesh=mesh, textures=None, environment=Environment(light), light=Environment(light))
+    monkeypatch.setattr(heldout, "reconstruct", lambda *args, **kwargs: maps)
+    monkeypatch.setattr(heldout, "asset_colors", lambda asset, scene, camera: (torch.ones(48, 48, dtype=bool), light))
+    with pytest.raises(InputError, match=f"another object in the sample of seed {seed}"):
+        evaluate(None, other, seed, 1, light)
 
 
 @pytest.mark.slow

@@ -187,3 +187,8 @@ def test_nodes_out_of_range_are_refused():
             graph_components(a, b, 3)
     with pytest.raises(ValueError, match="shape"):
         graph_components(good, good[:1], 3)
+
+
+def test_normals_of_a_tiny_mesh_are_those_of_a_large_one():
+    ball = mesh_from(trimesh.creation.icosphere(3))
+    assert torch.equal(vertex_normals(2.0**-20 * ball.vertices, ball.faces), vertex_normals(ball.vertices, ball.faces))

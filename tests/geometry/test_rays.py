@@ -264,6 +264,8 @@ def test_intersect_is_closest_with_gradients_in_rays_and_vertices(device):
     # on CUDA the rays of a vertex are added in any order
     same = torch.equal if device.type == "cpu" else lambda a, b: reference.fraction_within(a, b) >= 0.999
     assert all(same(a, b) for a, b in zip(got, expected, strict=True)) and float(got[1][~seen].abs().sum()) == 0.0
+    with pytest.raises(TypeError, match="vertices: expected"):
+        scene.intersect(o, d, vertices=scene.vertices.double())
     with pytest.raises(ValueError, match="vertices: expected the positions of the scene"):
         scene.intersect(o, d, vertices=v + 1.0)
     with pytest.raises(TypeError, match="faces: expected a tensor"):

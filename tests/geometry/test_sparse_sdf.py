@@ -76,3 +76,11 @@ def test_wrong_grids_are_named():
         sparse(torch.zeros(2, 9, 9), torch.ones(2, 9, 9, dtype=torch.bool))
     with pytest.raises(TypeError, match="near: expected torch.bool"):
         sparse(torch.zeros(9, 9, 9), torch.ones(9, 9, 9))
+
+
+def test_a_permuted_grid_has_the_same_values():
+    sdf = lumps(grid(24))
+    near = sdf < 2.0
+    turned = sdf.permute(2, 1, 0)
+    got = sparse_sdf(torch.full_like(sdf, 9.0).permute(2, 1, 0), near.permute(2, 1, 0), lambda k: turned.reshape(-1)[k])
+    assert torch.equal(got, sparse(turned.contiguous(), near.permute(2, 1, 0).contiguous())[0])

@@ -270,3 +270,9 @@ def test_an_atlas_of_xatlas_with_nan_is_refused(monkeypatch):
     monkeypatch.setattr(uv, "XATLAS", uv.XATLAS.replace("uv=uv", "uv=uv * numpy.nan"))
     with pytest.raises(RuntimeError, match="unwrap_xatlas: expected finite texture coordinates"):
         unwrap_xatlas(icosphere(1), texture_size=64)
+
+
+def test_more_charts_than_texels_are_refused():
+    corners = torch.rand(300, 3, 3, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match="texture_size: expected more texels for the 300 charts"):
+        unwrap(mesh_of(corners.reshape(-1, 3).numpy(), np.arange(900).reshape(-1, 3)), texture_size=16)

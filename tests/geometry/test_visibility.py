@@ -91,3 +91,19 @@ def test_wrong_inputs_are_reported(device):
         visible_from(scene, p, p, camera, torch.ones(4, 1, 3, dtype=torch.bool, device=device))
     with pytest.raises(TypeError, match="active: expected torch.bool"):
         visible_from(scene, p, p, camera, torch.ones(4, 3, device=device))
+
+
+@pytest.mark.parametrize("scale", [2.0**-12, 2.0**12])
+def test_visibility_does_not_depend_on_the_scale(device, scale):
+    """Two balls that hide each other; the scale is a power of two, so that all numbers but the offset scale exactly."""
+    balls = [trimesh.creation.icosphere(3).apply_translation([0.6 * k, 0, 0]).apply_scale(0.5) for k in (-1, 1)]
+    both, camera = trimesh.util.concatenate(balls), rig(device)
+    mesh, normal = mesh_from(both, device), torch.tensor(both.vertex_normals, dtype=torch.float32, device=device)
+    c2w = camera.c2w.clone()
+    c2w[:, :3, 3] *= scale
+    index = torch.arange(0, len(mesh.vertices), 3)
+    found = []
+    for factor, cameras in ((1.0, camera), (scale, Camera(c2w, camera.intrinsics, SIZE, SIZE))):
+        vertices = factor * mesh.vertices
+        found.append(visible_from(RayScene(vertices, mesh.faces), vertices[index], normal[index], cameras))
+    assert torch.equal(*found) and 0.1 < float(found[0].float().mean()) < 0.9

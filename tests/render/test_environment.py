@@ -209,3 +209,11 @@ def test_irradiance_faces_the_lamp(device):
     got = Environment(radiance).irradiance()
     assert int(got.radiance[..., 1].argmax()) == 5 * 32 + 9
     assert got.radiance[..., 0].abs().max() == 0
+
+
+def test_enlarging_is_periodic_in_azimuth():
+    radiance = torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(0))
+    larger = Environment(radiance).resized(24).radiance
+    turned = Environment(radiance.roll(5, 1)).resized(24).radiance
+    torch.testing.assert_close(turned, larger.roll(15, 1), rtol=0, atol=1e-5)
+    torch.testing.assert_close(larger[1::3, 1::3], radiance, rtol=0, atol=1e-5)  # at the centers of the texels

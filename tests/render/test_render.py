@@ -271,7 +271,10 @@ def test_parts_shadow_each_other_and_keep_their_base_color(device):
 
 def test_lookups_follow_the_maps(device):
     maps = textures(8, device, (0.5, 0.2, 0.1), roughness=0.3)
+    with torch.inference_mode():
+        assert maps.rough_metal().is_inference()
     first = maps.rough_metal()
+    assert not first.is_inference()
     assert maps.rough_metal() is first  # kept
     maps.roughness.fill_(0.9)
     again = maps.rough_metal()

@@ -233,3 +233,10 @@ def test_bad_input_is_named(device):
     with pytest.raises(ValueError, match="lobe: expected"):
         sample_bsdf(wo, alpha, u, lobe="other")
     assert sample_ggx_vndf(wo[:0], alpha[:0], u[:0]).shape == (0, 3)
+
+
+def test_shapes_that_do_not_broadcast_are_named():
+    with pytest.raises(ValueError, match=r"wo, alpha, u: expected shapes that broadcast, got .*\(5,\).*\(4,\)"):
+        sample_ggx_vndf(torch.rand(5, 3), torch.rand(4), torch.rand(5, 2))
+    with pytest.raises(ValueError, match="expected shapes that broadcast"):
+        eval_bsdf(torch.rand(5, 3), torch.rand(3), torch.rand(4), torch.rand(()), torch.rand(3))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors.torch import load_file, save_file
 
 from reli3d.cli.data import main as data
 from reli3d.errors import InputError
@@ -174,3 +175,8 @@ def test_latents_decode_to_the_light_and_are_kept(samples, tmp_path):
     assert float(bright.max()) > 1.3 * float(bright.min())  # by a decoder that nothing was taught
     other = fitted(model.environment, files[:1], tmp_path / "cache", steps=40)
     assert not torch.equal(other[files[0].stem][0], latent)  # another number of steps is another fit
+    tensors = load_file(files[0])
+    tensors["environment"] = tensors["environment"].flip(1).contiguous()
+    save_file(tensors, tmp_path / files[0].name)
+    rendered = fitted(model.environment, [tmp_path / files[0].name], tmp_path / "cache", steps=60)
+    assert not torch.equal(rendered[files[0].stem][0], latent)  # another light under the same name

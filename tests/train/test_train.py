@@ -241,6 +241,8 @@ def test_a_new_stage_is_a_subclass_with_its_terms(folder, tmp_path):
             return 1.0 if parameter.startswith("light.") else 0.0
 
     stage = Brightness(LocalReconstructor(SMALL), [folder], SmallOptions(1, 64))
+    train(stage, stage.options(str(tmp_path / "saved"), steps=3, batch=1, save_every=1))  # more often than log_every
+    assert len((tmp_path / "saved" / "log.jsonl").read_text().splitlines()) == 4  # options and steps
     before = {k: v.clone() for k, v in stage.model.state_dict().items()}
     train(stage, stage.options(str(tmp_path), steps=2, batch=1))
     changed = {k for k, v in stage.model.state_dict().items() if not torch.equal(v, before[k])}

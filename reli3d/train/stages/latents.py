@@ -44,7 +44,8 @@ def fitted(
 ) -> Latents:
     """Fits latents and strength to the lighting of each sample; returns them by the stem of its file.
 
-    cache: safetensors file of earlier results, valid for the same decoder and number of steps; updated.
+    cache: safetensors file of earlier results by the hash of the lighting, valid for the same decoder and number of
+    steps; updated.
     """
     digest = hashlib.sha256(str(steps).encode())
     for name, value in decoder.state_dict().items():
@@ -54,16 +55,22 @@ def fitted(
         with safe_open(cache, "pt") as file:
             if (file.metadata() or {}).get("decoder") == digest.hexdigest():
                 known = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no iterable
-    missing = [p for p in files if f"{p.stem}.latent" not in known]
-    for done, path in enumerate(missing):
-        with safe_open(path, "pt") as file:
-            light = quarter_turn(file.get_tensor("environment").float(), -1)  # stored with -Z at the horizontal center
+    stored = {p.stem: _environment(p) for p in files}
+    keys = {stem: hashlib.sha256(light.numpy().tobytes()).hexdigest() for stem, light in stored.items()}
+    missing = [stem for stem, key in keys.items() if f"{key}.latent" not in known]
+    for done, stem in enumerate(missing):
+        light = quarter_turn(stored[stem].float(), -1)  # stored with -Z at the horizontal center
         latent, strength, error = fit_latent(decoder, light.to(decoder.sample_directions.device), steps=steps)
-        known[f"{path.stem}.latent"], known[f"{path.stem}.strength"] = latent.cpu(), strength.cpu()
+        known[f"{keys[stem]}.latent"], known[f"{keys[stem]}.strength"] = latent.cpu(), strength.cpu()
         if done % 16 == 15:
             progress(f"latents: {done + 1} of {len(missing)} lights, the last with error {error:.3f}")
     if missing:
         cache.parent.mkdir(parents=True, exist_ok=True)
         with replacing(cache) as temporary:
             save_file({k: v.contiguous() for k, v in known.items()}, temporary, {"decoder": digest.hexdigest()})
-    return {p.stem: (known[f"{p.stem}.latent"], known[f"{p.stem}.strength"]) for p in files}
+    return {stem: (known[f"{key}.latent"], known[f"{key}.strength"]) for stem, key in keys.items()}
+
+
+def _environment(path: Path) -> Tensor:
+    with safe_open(path, "pt") as file:
+        return file.get_tensor("environment")
