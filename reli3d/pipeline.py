@@ -46,7 +46,7 @@ from reli3d.views.folder import load_views
 from reli3d.views.normalize import FAR_DISTANCES, normalize
 from reli3d.views.published_views import BACKGROUNDS, background_shown, hero_first, placement_notes
 from reli3d.views.similarity import Similarity, output_frame
-from reli3d.views.views import ViewBatch, Views
+from reli3d.views.views import ViewBatch, Views, whole_views
 
 if TYPE_CHECKING:
     from reli3d.fit.refine import Refinement
@@ -338,6 +338,8 @@ def place(views: Views, preset: Preset | LocalPreset, options: ReconstructOption
         if normalization == "none":
             views = replace(views, notes=(*views.notes, *placement_notes(views)))
     views = hero_first(views, options.hero)
+    if options.hero and isinstance(preset, Preset):
+        views = replace(views, notes=(*views.notes, f"reference view: {views.names[0]}"))
     to_model = normalization if isinstance(normalization, Similarity) else normalize(views, normalization)
     return Placed(views, to_model, output_frame(options.up))
 
@@ -420,7 +422,10 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     >>> asset = reli3d.refine(reli3d.reconstruct(views.taken()), views, seconds=60)
     """
     options = {"light": views.lighting, **options}
-    batch = views.to(asset.mesh.vertices.device).resampled(REFINED)
+    whole = whole_views(views.masks)
+    if not isinstance(options["light"], str) and len(options["light"]) == len(views):
+        options["light"] = [options["light"][i] for i in whole]
+    batch = views.select(whole).to(asset.mesh.vertices.device).resampled(REFINED)
     return _refined(asset, batch, seconds=seconds, steps=steps, **options).asset
 
 
@@ -508,9 +513,9 @@ def reconstruct_folder(
         views, batch = photographs.taken(), None
         fit: dict[str, Any] = {}
         if reading.budget:
-            batch = photographs.resampled(REFINED)
+            photographs = photographs.select(whole_views(photographs.masks))
+            batch, names = photographs.resampled(REFINED), photographs.names
             fit = {"light": reading.lighting(photographs), "cameras": reading.cameras, **reading.budget}
-        names = photographs.names
         del photographs  # 1 GB of 60 images of 1 MP
     if options.up == "y" and (axis := up_axis(views.c2w)) not in (None, "y"):
         views = replace(views, notes=(*views.notes, f"the cameras suggest {axis} as the up axis: try --up {axis}"))

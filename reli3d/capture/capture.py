@@ -111,7 +111,7 @@ def capture(
     options = options or CaptureOptions()
     source, output = Path(source), Path(output)
     _check_options(options)
-    _check_output(source, output)
+    _check_output(source, output, options.masks)
     photos, notes = read_photos(source, progress)
     report = CaptureReport(len(photos), notes=notes, mask_method="given" if options.masks else options.mask_method)
     region = None
@@ -176,10 +176,12 @@ def _check_options(options: CaptureOptions) -> None:
         raise InputError("size", f"expected 0.1 to 1000000 millimeters, got {options.size}")
 
 
-def _check_output(source: Path, output: Path) -> None:
+def _check_output(source: Path, output: Path, masks: Path | None) -> None:
     check_place(output)
     if output.resolve() in (source.resolve(), *source.resolve().parents) and (output / "capture.json").exists():
         raise InputError(output, "expected a folder without the images that are read, got theirs; give another")
+    if masks and output.resolve() in (masks.resolve(), *masks.resolve().parents):
+        raise InputError(masks, "expected masks outside the output, which is replaced; copy them to another folder")
     if output.is_dir() and any(output.iterdir()) and not (output / "capture.json").exists():
         raise InputError(output, "expected an empty folder or an earlier capture, got other files; give another")
 

@@ -21,6 +21,7 @@ FRAME_COUNT = 60  # frames taken from a video
 MOST_PHOTOS = 120  # of a folder: of more every second, third, ... is read
 FEWEST = 8  # photographs, below which no closed shape can be expected
 MAX_PIXELS = 1 << 27
+HDR_TRANSFERS = (16, 18)  # PQ and HLG, as FFmpeg numbers transfer functions
 WHOLE_VIDEO = 0.9  # fraction of the frames that a file announces, below which it is cut off
 SHARPNESS_SIDE = 640  # pixels at which sharpness is compared
 MILLIMETERS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
@@ -113,7 +114,10 @@ def _read_photo(path: Path, name: str) -> Photo:
             tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
             stored = image.size
             image.draft("RGB", (LONGEST_SIDE, LONGEST_SIDE))
-            upright = ImageOps.exif_transpose(image).convert("RGB")
+            upright = ImageOps.exif_transpose(image)
+            if upright.mode.startswith("I;16"):
+                upright = Image.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
+            upright = upright.convert("RGB")
             upright.thumbnail((LONGEST_SIDE, LONGEST_SIDE), Image.Resampling.BOX, reducing_gap=None)
     except InputError:
         raise
@@ -166,7 +170,7 @@ def _read_video(path: Path, progress: Progress) -> tuple[list[Photo], list[str]]
     av = optional_module("av")
     file_size(path)
     best: dict[int, tuple[float, np.ndarray]] = {}
-    count, total, reason = 0, 0, ""
+    count, total, reason, hdr = 0, 0, "", list[str]()
     try:
         with av.open(str(path)) as file:
             if not file.streams.video:
@@ -174,9 +178,15 @@ def _read_video(path: Path, progress: Progress) -> tuple[list[Photo], list[str]]
             stream = file.streams.video[0]
             stream.thread_type = "AUTO"
             total = stream.frames or round(float((file.duration or 0) / 1e6 * float(stream.average_rate or 30)))
+            if not total:  # a stream without an index, such as a browser's WebM
+                with av.open(str(path)) as again:
+                    total = sum(1 for packet in again.demux(again.streams.video[0]) if packet.size)
+            aspect = float(stream.sample_aspect_ratio or 1)
+            if stream.codec_context.color_trc in HDR_TRANSFERS:
+                hdr.append("the video is HDR: its colors are not converted and look pale; record in SDR")
             window = max(1.0, total / FRAME_COUNT)
             for frame in file.decode(stream):
-                pixels = _frame_pixels(frame)
+                pixels = _frame_pixels(frame, aspect)
                 score, at = sharpness(pixels), min(FRAME_COUNT - 1, int(count / window))
                 if at not in best or score > best[at][0]:
                     best[at] = score, pixels
@@ -186,7 +196,7 @@ def _read_video(path: Path, progress: Progress) -> tuple[list[Photo], list[str]]
         raise
     except Exception as error:  # FFmpeg's errors have many classes
         reason = shown(getattr(error, "strerror", None) or str(error))
-    notes = [f"{len(best)} sharp frames taken of {count} of the video"]
+    notes = [f"{len(best)} sharp frames taken of {count} of the video", *hdr]
     if count < WHOLE_VIDEO * total:  # FFmpeg ends without an error where a file is cut off
         notes.append(f"only {count} of the {total} frames of the video can be decoded: the file is cut off or broken")
         reason = reason or f"{count} of {total} frames: the file is cut off"
@@ -195,9 +205,10 @@ def _read_video(path: Path, progress: Progress) -> tuple[list[Photo], list[str]]
     return [Photo(f"frame_{k:04d}", best[k][1], None, (best[k][1].shape,)) for k in sorted(best)], notes
 
 
-def _frame_pixels(frame) -> np.ndarray:
-    """RGB of a decoded frame, upright, reduced to LONGEST_SIDE."""
-    scale = min(1.0, LONGEST_SIDE / max(frame.width, frame.height))
-    pixels = frame.to_ndarray(format="rgb24", width=round(frame.width * scale), height=round(frame.height * scale))
+def _frame_pixels(frame, aspect: float) -> np.ndarray:
+    """RGB of a decoded frame, upright, with square pixels, reduced to LONGEST_SIDE.  aspect: of a stored pixel."""
+    width, height = frame.width * aspect, frame.height
+    scale = min(1.0, LONGEST_SIDE / max(width, height))
+    pixels = frame.to_ndarray(format="rgb24", width=round(width * scale), height=round(height * scale))
     turns = round(float(getattr(frame, "rotation", 0) or 0) / 90.0) % 4  # degrees counter-clockwise
     return np.ascontiguousarray(np.rot90(pixels, turns))

@@ -81,7 +81,8 @@ def glb_files(paths: list[Path] | None) -> tuple[Path, ...]:
 
     found: list[Path] = []
     for path in paths or ():
-        inside = sorted(path.rglob("*.glb")) if path.is_dir() else [path]
+        below = (p for p in path.rglob("*") if p.suffix.lower() == ".glb" and not p.name.startswith("."))
+        inside = sorted(below) if path.is_dir() else [path]
         if not inside:
             raise InputError(path, "expected GLB files, got none in this folder")
         found += inside

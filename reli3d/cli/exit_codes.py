@@ -142,8 +142,8 @@ def write_log(target: Path, error: BaseException) -> Path | None:
     """Writes the traceback of ``error`` to :func:`log_of` the target; returns its path, None if that fails."""
     from reli3d.io.files import write_bytes
 
-    path = log_of(target)
     try:
+        path = log_of(target)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(path, "".join(traceback.format_exception(error)).encode(errors="backslashreplace"))
     except OSError:

@@ -76,7 +76,8 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
     from reli3d.io.usd import usdz_bytes
 
     notes: list[str] = []
-    parts = read_glb(args.glb, notes=notes)
+    origin: list[float] = []
+    parts = read_glb(args.glb, notes=notes, origin=origin if args.format == "glb" else None)
     for note in notes:
         print(f"reli3d-export: {note}", file=sys.stderr)
     if len(parts) != 1:
@@ -92,7 +93,7 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
         asset = transfer_textures(asset.mesh, asset, baked)
     name = args.glb.stem
     if args.format == "glb":
-        files = {f"{name}.glb": glb_bytes(asset, textures=args.textures)}
+        files = {f"{name}.glb": glb_bytes(asset, textures=args.textures, translation=origin)}
     elif args.format == "obj":
         files = obj_files(asset, name)
     else:

@@ -41,7 +41,8 @@ def main(argv: list[str] | None = None) -> int:
 
     def done(row: objects.Row) -> None:
         if args.workers is not None or args.ray is not None:  # without progress bars
-            report(f"{printable(row.object)}: {row.seconds:.1f} s")
+            took = "" if row.seconds is None else f": {row.seconds:.1f} s"  # None: complete before its worker crashed
+            report(f"{printable(row.object)}{took}")
         if not args.json:
             print(args.output / row.object / "mesh.glb", flush=True)
 
@@ -58,6 +59,8 @@ def checked_items(args: argparse.Namespace) -> list[objects.Item]:
     from reli3d.output.folder import check_place
 
     items = objects.items_of(args.folder or [EXAMPLE], args.output)
+    if args.masks and len(items) > 1:
+        raise InputError("--masks", f"expected one object with it, got {len(items)}; put masks into each folder")
     for item in items:
         check_place(item.target)  # before minutes of work
     if (args.output / objects.SUMMARY).is_dir():

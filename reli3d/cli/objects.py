@@ -154,6 +154,8 @@ def items_of(paths: Sequence[Path], output: Path) -> list[Item]:
 
 def listed(path: Path) -> list[Path]:
     """The folders named in a text file, one per line, relative to the working directory.  Raises InputError."""
+    if path.suffix.lower() == ".json" or path.name in ("cameras.txt", "images.txt"):
+        raise InputError(path, f"expected a folder or a list of folders, got a camera file; give {path.parent}")
     try:
         lines = re.split(r"[\r\n]+", read_bytes(path, MAX_LIST).decode("utf-8-sig"))  # names may have other separators
     except UnicodeDecodeError as error:

@@ -179,7 +179,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
 
     device = torch.device(args.device)
     notes: list[str] = []
-    parts = [part.to(device) for part in read_glb(args.glb, notes=notes)]
+    parts = [part.to(device) for part in read_glb(args.glb, notes=notes, origin=[])]
     light = Environment(torch.ones(8, 16, 3)) if args.light is None else read_environment(args.light, notes=notes)
     for note in notes:
         print(f"reli3d-render: {note}", file=sys.stderr)

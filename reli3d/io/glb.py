@@ -226,7 +226,9 @@ def write_glb(
 
 
 @full_precision
-def read_glb(path: str | os.PathLike, *, notes: list[str] | None = None, **limits: int) -> list[Asset]:
+def read_glb(
+    path: str | os.PathLike, *, notes: list[str] | None = None, origin: list[float] | None = None, **limits: int
+) -> list[Asset]:
     """Reads a GLB file: one :class:`Asset` per primitive, in scene coordinates, without environment.
 
     Node transforms, skins in the rest pose and morph targets with their default weights are applied.  Vertex colors
@@ -235,10 +237,12 @@ def read_glb(path: str | os.PathLike, *, notes: list[str] | None = None, **limit
     computed by MikkTSpace.  Specular-glossiness materials are converted.
 
     notes: receives one line for every feature that is ignored (animation, emission, occlusion, alpha, points, lines,
-    extensions such as clearcoat).  Compressed data (Draco, meshopt, KTX2) is an error.  limits: see
-    :func:`reli3d.io.gltf_parts.read_parts`.  Raises InputError, a ValueError, naming field, value and fix.
+    extensions such as clearcoat).  origin: an empty list, which receives the position (x, y, z) of the first mesh's
+    node; vertices are relative to it, so that those far from the scene's origin keep their float32 digits.  Compressed
+    data (Draco, meshopt, KTX2) is an error.  limits: see :func:`reli3d.io.gltf_parts.read_parts`.  Raises InputError, a
+    ValueError, naming field, value and fix.
 
     >>> reli3d.write_glb("object.glb", asset)
     >>> parts = reli3d.read_glb("object.glb")
     """
-    return read_parts(path, notes=notes, **limits)
+    return read_parts(path, notes=notes, origin=origin, **limits)

@@ -282,8 +282,11 @@ class Document:
             return np.stack([index[k + 1], index[k + 2], np.broadcast_to(index[:1], count)], 1).astype(np.int32)
         return np.stack([index[k], index[k + 1 + k % 2], index[k + 2 - k % 2]], 1)
 
-    def placed_meshes(self) -> list[Placed]:
-        """The meshes of all visible nodes of the scene."""
+    def placed_meshes(self, origin: list[float] | None = None) -> list[Placed]:
+        """The meshes of all visible nodes of the scene.
+
+        origin: receives the position of the first one, which is subtracted from all.
+        """
         scenes = self.get(self.json, "scenes", list, "scenes", [])
         nodes = self.get(self.json, "nodes", list, "nodes", [])
         if scenes:
@@ -315,6 +318,10 @@ class Document:
                 found.append(number)
             children = self.get(node, "children", list, f"nodes[{number}].children", [])
             stack += [(c, world, depth + 1, hidden) for c in reversed(children)]
+        if origin is not None and found:
+            origin[:] = worlds[found[0]][:3, 3].tolist()
+            for world in worlds.values():
+                world[:3, 3] -= origin
         return [self._placed(number, worlds) for number in found]
 
     def _placed(self, number: int, worlds: dict[int, np.ndarray]) -> Placed:

@@ -21,6 +21,7 @@ def read_parts(
     path: str | os.PathLike,
     *,
     notes: list[str] | None = None,
+    origin: list[float] | None = None,
     max_bytes: int = 1 << 29,
     max_vertices: int = 20_000_000,
     max_pixels: int = 1 << 26,
@@ -32,7 +33,7 @@ def read_parts(
     document = Document(path, max_bytes=max_bytes, max_vertices=max_vertices)
     materials = Materials(document, max_pixels)
     parts, vertices = [], 0
-    placed = document.placed_meshes()
+    placed = document.placed_meshes(origin)
     count = sum(len(document.get(p.mesh, "primitives", list, f"{p.name}.primitives")) for p in placed)
     if count > MAX_PARTS:
         document.fail("meshes", f"expected at most {MAX_PARTS} primitives as placed", count, "join the meshes")

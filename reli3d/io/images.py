@@ -7,8 +7,10 @@ image size in the camera file fits only the rotated image.
 
 import io
 import os
+import re
 import warnings
 import zlib
+from pathlib import Path
 from threading import BoundedSemaphore, Lock
 
 import numpy as np
@@ -25,7 +27,18 @@ MAX_PIXELS = 1 << 26  # 64 MP: 256 MiB of RGBA, above any camera this is meant f
 MAX_BYTES = 1 << 29  # an uncompressed 16-bit RGBA image of MAX_PIXELS
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF")  # nothing that runs a program or unpacks streams of its own
 MAX_SCANS = 100  # progressive files have about ten; a thousand in a small file take minutes
-ORIENTATION = 0x0112  # of EXIF; 5 to 8 swap the sides
+ORIENTATION = 0x0112  # of EXIF
+QUARTER_TURNS = (5, 6, 7, 8)  # orientations that exchange the sides
+UNTURNED = {  # what restores the stored pixels
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # of a JPEG segment; others are part of the scan's data
 ASPECT = 0.01  # relative difference up to which two sizes have the same aspect
 _TOP = {"L": 255, "RGB": 255, "RGBA": 255, "F": 65535}  # mode: the value that is 1
 _DECODING = BoundedSemaphore(2)  # images at a time: one of 24 MP takes 96 MB
@@ -123,11 +136,18 @@ def _decoded(path, image: Image.Image, notes: list[str], calibrated: tuple[int, 
     orientation = image.getexif().get(ORIENTATION, 1)
     if orientation not in (0, 1):
         name = f"{os.path.basename(path)}: EXIF orientation {shown(orientation)}"
-        if calibrated and _aspect(calibrated, (height, width)) and not _aspect(calibrated, image.size):
+        tiff = image.format == "TIFF"  # Pillow turns it and exchanges the sides before
+        stored = image.size[::-1] if tiff and orientation in QUARTER_TURNS else image.size
+        applied = calibrated and _aspect(calibrated, stored[::-1]) and not _aspect(calibrated, stored)
+        if calibrated and applied:
             notes.append(f"{name} applied: the camera file has {calibrated[0]} x {calibrated[1]} pixels")
-            image = ImageOps.exif_transpose(image)
         else:
             notes.append(f"{name} not applied, cameras refer to stored pixels")
+        if tiff:
+            image.load()
+            image = image if applied or orientation not in UNTURNED else image.transpose(UNTURNED[orientation])
+        elif applied:
+            image = ImageOps.exif_transpose(image)
     if image.mode.startswith("I"):
         gray = np.asarray(image).astype(np.float32)
         if image.mode == "I" and (gray.min() < 0 or gray.max() > 65535):
@@ -154,9 +174,16 @@ def _several(image: Image.Image) -> bool:
 
 
 def _scans(path) -> int:
-    """Scans of a JPEG file; each passes over the whole image.  A few more where a thumbnail is embedded."""
-    with open(path, "rb") as file:
-        return file.read().count(b"\xff\xda")
+    """Scans of a JPEG file, without what follows its end; each passes over the whole image."""
+    data = Path(path).read_bytes()
+    at, scans = 2, 0
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xD9:
+        scan, at = data[at + 1] == 0xDA, at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        scans += scan
+        if scan:
+            marker = _MARKER.search(data, at)
+            at = marker.start() if marker else len(data)
+    return scans
 
 
 def png_bytes(pixels: Tensor | np.ndarray) -> bytes:

@@ -52,6 +52,8 @@ def check_place(folder: Path) -> Path:
     """:func:`check_folder` of a result folder and of its parent, in which siblings are created."""
     folder = check_folder(folder)
     check_folder(folder.parent)
+    if folder == Path(os.path.realpath(os.curdir)):
+        raise InputError(folder, "expected a folder other than the working one, which is replaced; run from its parent")
     if os.path.ismount(folder):
         raise InputError(folder, "expected a folder that can be renamed, got a mount point; mount its parent")
     return folder

@@ -6,6 +6,7 @@ from types import ModuleType
 
 from PIL import Image
 
+BT709, LIMITED = 1, 1  # FFmpeg's numbers of the color space that players assume for HD, and of its range
 QUALITY = "18"  # x264's constant rate factor: no difference is seen from the frames
 
 
@@ -25,10 +26,14 @@ def mp4_bytes(frames: list[Image.Image], rate: int) -> bytes:
         stream = file.add_stream("libx264", rate=rate, options={"crf": QUALITY})
         stream.width, stream.height = frames[0].size
         stream.pix_fmt = "yuv420p"
+        context = stream.codec_context
+        context.colorspace = context.color_primaries = context.color_trc = BT709
+        context.color_range = LIMITED
         for image in frames:
             if image.mode == "RGBA":
                 image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
             frame = av.VideoFrame.from_image(image.convert("RGB"))
-            file.mux(stream.encode(frame))
+            limited = {"dst_colorspace": "ITU709", "dst_color_range": "MPEG"}
+            file.mux(stream.encode(frame.reformat(format="yuv420p", **limited)))
         file.mux(stream.encode())
     return data.getvalue()

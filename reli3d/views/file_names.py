@@ -1,6 +1,7 @@
 """File names regardless of case: image suffixes and lookup."""
 
 import os
+import unicodedata
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
@@ -26,9 +27,9 @@ class FolderIndex:
             if key not in self._names:
                 found: dict[str, list[str]] = {}
                 for name in _listed(at):
-                    found.setdefault(name.casefold(), []).append(name)
+                    found.setdefault(_key(name), []).append(name)
                 self._names[key] = found
-            names = self._names[key].get(part.casefold(), [])
+            names = self._names[key].get(_key(part), [])
             if part in names:
                 at = at / part
             elif len(names) == 1:
@@ -38,6 +39,11 @@ class FolderIndex:
             else:
                 return None
         return at
+
+
+def _key(name: str) -> str:
+    """Equal for names that differ in case or, as macOS stores them, in the composition of accents."""
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _listed(folder: Path) -> list[str]:
@@ -55,9 +61,11 @@ def named(folder: Path, names: Sequence[str]) -> list[str]:
 
 def images_in(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
     """The files of ``folder`` with one of ``endings`` in any case, sorted; empty if the folder does not exist."""
-    return sorted(p for p in (folder / name for name in _listed(folder)) if p.suffix.lower() in endings and p.is_file())
+    there = (folder / name for name in _listed(folder) if not name.startswith("."))  # not those of macOS
+    return sorted(p for p in there if p.suffix.lower() in endings and p.is_file())
 
 
 def images_below(folder: Path) -> list[Path]:
     """The images of ``folder`` and its sub-folders, sorted."""
-    return sorted(Path(at, n) for at, _, names in os.walk(folder) for n in names if Path(n).suffix.lower() in ENDINGS)
+    there = (Path(at, n) for at, _, names in os.walk(folder) for n in names if not n.startswith("."))
+    return sorted(path for path in there if path.suffix.lower() in ENDINGS)

@@ -10,7 +10,7 @@ from torch.nn.functional import max_pool2d, pad
 from reli3d._bridge import full_precision
 from reli3d.errors import InputError
 from reli3d.views.similarity import Similarity
-from reli3d.views.views import LEAST_WHOLE, Views, mask_box, touches_border
+from reli3d.views.views import Views, mask_box, whole_views
 
 RADIUS = 0.87  # half side of the network's cube
 HULL_SLACK = 1.1  # a hull of few views exceeds its object by about a tenth, so it may exceed the cube by as much
@@ -102,9 +102,7 @@ def visual_hull(views: Views) -> Hull:
     diameter derived from the masks' width, which bounds it along rays that no other view crosses.  Views whose mask
     touches the border are ignored if at least LEAST_WHOLE others remain.
     """
-    whole = [i for i, mask in enumerate(views.masks) if not touches_border(mask)]
-    if LEAST_WHOLE <= len(whole) < len(views):
-        views = views.select(whole)
+    views = views.select(whole_views(views.masks))
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
     masks = [m.cpu() for m in views.masks]
     origins, rays = c2w[:, :3, 3], center_rays(masks, c2w, intrinsics)

@@ -156,6 +156,12 @@ def touches_border(mask: Tensor) -> bool:
     return any(bool((line > 0.5).any()) for line in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
 
 
+def whole_views(masks: Sequence[Tensor]) -> list[int]:
+    """Indices of the ``masks`` that do not touch the border if there are LEAST_WHOLE of them, else of all."""
+    whole = [i for i, mask in enumerate(masks) if not touches_border(mask)]
+    return whole if len(whole) >= LEAST_WHOLE else list(range(len(masks)))
+
+
 def _window(mask: Tensor, padding: float) -> tuple[int, int, int, int]:
     x0, y0, x1, y1 = mask_box(mask)
     side = max(1, round(max(x1 - x0, y1 - y0) * (1.0 + 2.0 * padding)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from fractions import Fraction
 
 import av
 import numpy as np
@@ -110,6 +111,43 @@ def test_flash_and_mixed_sizes_are_reported(tmp_path):
     _, notes = read_photos(tmp_path, quiet)
     assert any("3 of 8" in n and "flash: the lighting differs" in n for n in notes)
     assert any("2 image sizes" in n for n in notes) and any("no focal length" in n for n in notes)
+
+
+def test_gray_photographs_of_16_bits_keep_their_contrast(tmp_path):
+    gray = textured(0)[..., 0]
+    for k in range(8):
+        Image.fromarray(gray.astype(np.uint16) * 257).save(tmp_path / f"{k}.png")
+    photos, _ = read_photos(tmp_path, quiet)
+    assert np.array_equal(photos[0].pixels, np.repeat(gray[..., None], 3, -1))
+
+
+class Sink:
+    """A target that cannot be rewound, such as a pipe: the file has no length."""
+
+    def __init__(self, path):
+        self.file = path.open("wb")
+
+    def write(self, data):
+        return self.file.write(data)
+
+
+def test_a_video_without_a_length_is_read_to_its_end_with_square_pixels(tmp_path):
+    path = tmp_path / "stream.mkv"
+    sink = Sink(path)
+    with av.open(sink, "w", format="matroska") as file:
+        stream = file.add_stream("libx264", rate=30, options={"crf": "12"})
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        stream.codec_context.color_trc = 16  # PQ
+        for k in range(2 * FRAME_COUNT):
+            file.mux(stream.encode(av.VideoFrame.from_image(Image.fromarray(textured(k // 2)))))
+        file.mux(stream.encode())
+    sink.file.close()
+    photos, notes = read_photos(path, quiet)
+    assert len(photos) == FRAME_COUNT and "60 sharp frames taken of 120" in notes[0]
+    assert photos[0].size == (427, 240) and any("HDR" in note for note in notes)
+    last = np.asarray(Image.fromarray(textured(FRAME_COUNT - 1)).resize((427, 240)), np.float64)
+    assert np.corrcoef(photos[-1].pixels.ravel(), last.ravel())[0, 1] > 0.8  # other frames: near 0
 
 
 def test_the_sharpest_frame_of_each_window_of_a_video_is_taken(tmp_path):

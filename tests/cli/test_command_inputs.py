@@ -47,6 +47,7 @@ def place(tmp_path, monkeypatch):
     np.save(tmp_path / "array.npy", np.ones((8, 4, 8, 3), np.float32))
     (tmp_path / "input").mkdir()
     (tmp_path / "input" / "mesh.glb").write_text("a reference")
+    (tmp_path / "input" / "transforms.json").write_text("{}")
     (tmp_path / "cut.npz").write_bytes((tmp_path / "maps.npz").read_bytes()[:300])
     for name, state in (
         ("list", [1]),
@@ -110,6 +111,9 @@ CASES = [
         ]
     ),
     (infer, ["input", "--output", "."], "mesh.glb would be replaced"),
+    (infer, ["input", "empty", "--output", "out", "--masks", "empty"], "--masks: expected one object"),
+    (infer, ["input/transforms.json", "--output", "out"], "got a camera file; give input"),
+    (infer, [".", "--output", ".."], "expected a folder other than the working one"),
     *(
         (data, ["render", "out", "--maps", *options], word)
         for options, word in [

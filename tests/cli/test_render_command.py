@@ -201,6 +201,8 @@ def test_the_name_of_the_output_makes_an_animation(scene, tmp_path, ending):
     if ending == "mp4":
         with av.open(str(path)) as file:
             assert file.streams.video[0].average_rate == 24
+            tags = file.streams.video[0].codec_context
+            assert [tags.colorspace, tags.color_primaries, tags.color_trc, tags.color_range] == [1, 1, 1, 1]  # BT.709
             frames = [frame.to_image() for frame in file.decode(video=0)]
     else:
         image = Image.open(path)

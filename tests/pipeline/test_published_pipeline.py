@@ -173,7 +173,7 @@ def test_the_command_takes_published_weights_and_reports_how_it_used_them(tiny, 
     folder = tmp_path / "out" / "example"
     assert sorted(p.name for p in folder.iterdir()) == sorted(results.FILES)
     info = json.loads((folder / "run_info.json").read_text())
-    assert info["environment_centre"] == "+X"
+    assert info["environment_centre"] == "+X" and f"reference view: {info['views'][0]}" in info["notes"]
     assert info["views"] == list(EXAMPLE.names[::-1]) and info["background"] == "visible"
     assert info["precision"] == "bfloat16" and load_model(weights).dtype == torch.float32
     assert info["model_from_input"] == torch.eye(4).tolist()  # poses as stored

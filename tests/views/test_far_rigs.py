@@ -10,16 +10,19 @@ import pytest
 import torch
 
 from reli3d.cli import infer
+from reli3d.cli.export import main as export
 from reli3d.errors import InputError
 from reli3d.io.glb import glb_bytes, read_glb
 from reli3d.nn.weights import load_model
 from reli3d.pipeline import ReconstructOptions, reconstruct
+from reli3d.render.asset import Asset
 from reli3d.views.folder import load_views
 from reli3d.views.normalize import FAR_DISTANCES, near_origin
 from reli3d.views.similarity import Similarity
 from tests.support import gltf, hostile
 from tests.support.example import QUICK, moved_example
 from tests.support.rigs import sphere_views
+from tests.support.scenes import ball_mesh, textures
 
 FARTHEST = (6e5, -4e5, 5e5)
 
@@ -125,6 +128,16 @@ def test_views_that_are_far_in_float32_are_refused_where_the_mesh_would_break():
     weights, options = load_model("small"), ReconstructOptions(texture_size=256, resolution=40)
     with pytest.raises(ValueError, match="views: expected an object near the origin, got one of size"):
         reconstruct(views.transformed(shift), weights=weights, options=options)
+
+
+def test_an_export_of_a_far_asset_keeps_its_vertices(tmp_path):
+    asset = Asset(ball_mesh(3, 0.6), textures(4, "cpu", (0.8, 0.1, 0.1)))
+    far = (4.0e6, -3.0e6, 10.0)
+    (tmp_path / "far.glb").write_bytes(glb_bytes(asset, translation=far))
+    assert export([str(tmp_path / "far.glb"), "--textures", "webp", "--output", str(tmp_path / "out")]) == 0
+    origin = []
+    (again,) = read_glb(tmp_path / "out" / "far.glb", origin=origin)
+    assert tuple(origin) == far and torch.equal(again.mesh.vertices, asset.mesh.vertices)
 
 
 def test_a_translation_goes_to_the_node_and_back(tmp_path):

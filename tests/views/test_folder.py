@@ -1,5 +1,6 @@
 import json
 import math
+from pathlib import PurePath
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from PIL import Image
 
 from reli3d.errors import InputError
 from reli3d.geometry.camera import project
+from reli3d.views.file_names import FolderIndex, images_below, images_in
 from reli3d.views.folder import MAX_VIEWS, load_views
 from reli3d.views.frames import distortion_pixels
 from tests.support import hostile
@@ -245,3 +247,15 @@ def test_the_lighting_of_a_capture_is_read(tmp_path):
     transforms(tmp_path, frames, lighting="turntable")
     with pytest.raises(InputError, match="lighting: expected object or camera"):
         load_views(tmp_path)
+
+
+def test_accents_in_either_composition_name_one_file(tmp_path):
+    composed, decomposed = "St\u00fcck.png", "Stu\u0308ck.png"
+    (tmp_path / decomposed).write_bytes(b"")
+    assert FolderIndex().find(tmp_path, PurePath(composed)) == tmp_path / decomposed
+
+
+def test_resource_files_of_macos_are_no_images(tmp_path):
+    for name in ("a.png", "._a.png"):
+        (tmp_path / name).write_bytes(b"")
+    assert images_in(tmp_path) == images_below(tmp_path) == [tmp_path / "a.png"]

@@ -13,6 +13,7 @@ from PIL import Image
 
 from reli3d.errors import InputError
 from reli3d.geometry.camera import project
+from reli3d.io.images import decode_image
 from reli3d.views.folder import load_views
 from reli3d.views.reduce import MAX_FULL_PIXELS, MAX_OBJECT_PIXELS, cut
 from tests.support import hostile
@@ -104,6 +105,28 @@ def test_a_large_mask_of_isolated_pixels_is_empty(tmp_path):
     Image.fromarray(specks).save(folder / "masks/a.png")
     with pytest.raises(InputError, match="mask that is empty"):
         load_views(folder)
+
+
+@pytest.mark.parametrize("orientation", range(2, 9))
+@pytest.mark.parametrize("compression", ["raw", "tiff_lzw"])
+def test_the_orientation_of_a_tiff_is_not_applied_either(tmp_path, orientation, compression):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    pixels = hostile.random_image(alpha=False)[:24]
+    Image.fromarray(pixels).save(tmp_path / "a.tif", exif=exif, compression=compression)
+    notes = []
+    assert np.array_equal(np.asarray(decode_image(tmp_path / "a.tif", notes=notes)), pixels)
+    assert "not applied" in notes[0]
+    if orientation > 4:  # sides exchanged, as in the camera file
+        turned = decode_image(tmp_path / "a.tif", notes=notes, calibrated=(24, pixels.shape[1]))
+        assert turned.size == (24, pixels.shape[1]) and " applied: " in notes[1]
+
+
+def test_a_video_behind_a_photograph_is_no_scan(tmp_path):
+    Image.fromarray(hostile.random_image(alpha=False)).save(tmp_path / "a.jpg", progressive=True)
+    noise = np.random.default_rng(0).bytes(1 << 23)  # has the bytes of a scan's start about 128 times
+    (tmp_path / "a.jpg").write_bytes((tmp_path / "a.jpg").read_bytes() + noise)
+    assert decode_image(tmp_path / "a.jpg").size == (hostile.SIDE, hostile.SIDE)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the peak of a process is read from Linux' /proc")

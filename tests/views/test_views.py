@@ -1,7 +1,11 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 from reli3d.geometry.camera import project
+from reli3d.pipeline import refine
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import MASK_EDGE, Views, mask_box
 from tests.support.rigs import sphere_views
@@ -119,3 +123,17 @@ def test_views_are_checked():
     empty = Views(v.images, (v.masks[0] * MASK_EDGE, v.masks[1]), v.c2w, v.intrinsics, v.names)
     with pytest.raises(ValueError, match="empty mask"):
         empty.resampled(32)
+
+
+def test_cut_off_views_are_left_out_of_a_refinement_while_eight_remain(monkeypatch):
+    views = sphere_views(count=9, size=(64, 64))
+    cut_off = (torch.ones_like(views.masks[0]), *views.masks[1:])
+    fitted = []
+    monkeypatch.setattr(
+        "reli3d.pipeline._refined", lambda asset, batch, **given: fitted.append((batch, given)) or asset
+    )
+    asset = SimpleNamespace(mesh=SimpleNamespace(vertices=torch.zeros(1, 3)), asset=None)
+    refine(asset, replace(views, masks=cut_off), steps=1, light=list(range(9)))
+    refine(asset, replace(views, masks=cut_off).select(8), steps=1)
+    assert [len(batch) for batch, _ in fitted] == [8, 8] and fitted[0][1]["light"] == list(range(1, 9))
+    assert torch.equal(fitted[0][0].c2w, views.c2w[1:]) and torch.equal(fitted[1][0].c2w, views.c2w[:8])
