@@ -317,6 +317,8 @@ def make_charts(
     neighbors = face_neighbors(faces)
     label = merge_small(axis_labels(normal, neighbors), normal, neighbors, least_texels)
     chart, count = components(neighbors, label)
+    empty = np.bincount(chart, size, count) == 0.0
+    neighbors = np.where(empty[chart][:, None], -1, neighbors)  # so that closed parts without area have a border
     right, up = _frames(normal, label, chart, count)
     centers = local[faces].mean(1).astype(np.float64)
     for _ in range(CUT_ROUNDS):

@@ -276,3 +276,11 @@ def test_more_charts_than_texels_are_refused():
     corners = torch.rand(300, 3, 3, generator=torch.Generator().manual_seed(0))
     with pytest.raises(ValueError, match="texture_size: expected more texels for the 300 charts"):
         unwrap(mesh_of(corners.reshape(-1, 3).numpy(), np.arange(900).reshape(-1, 3)), texture_size=16)
+
+
+def test_a_closed_part_without_area_is_unwrapped_with_the_rest():
+    box = trimesh.creation.box()
+    points = np.concatenate([box.vertices, [[2.0, 0, 0], [2.5, 0, 0], [3.0, 0, 0]]])
+    mesh = unwrap(mesh_of(points, np.concatenate([box.faces, [[8, 9, 10], [10, 9, 8]]])), texture_size=128)
+    assert bool(torch.isfinite(mesh.uv).all()) and len(mesh.faces) == 14
+    assert (np.abs(areas(mesh))[:12] > 0).all()
