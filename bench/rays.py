@@ -3,6 +3,7 @@
 ``python -m bench.rays`` prints how the time of a ray grows with rays and triangles, and where it goes.
 """
 
+import math
 import sys
 import time
 
@@ -26,19 +27,19 @@ def inputs(n, subdivisions=6):
     return mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), origins, directions
 
 
-def cast(device, n, query, subdivisions=6):
+def cast(device, n, query, subdivisions=6, rays=inputs):
     """``n`` rays through :class:`RayScene`, closest hit or occlusion."""
-    vertices, faces, origins, directions = (torch.from_numpy(a).to(device) for a in inputs(n, subdivisions))
+    vertices, faces, origins, directions = (torch.from_numpy(a).to(device) for a in rays(n, subdivisions))
     scene = RayScene(vertices, faces)
     call = scene.closest if query == "closest" else scene.occluded
     return lambda: call(origins, directions), {"rays": n}
 
 
-def embree_cast(device, n, query, subdivisions=6):
+def embree_cast(device, n, query, subdivisions=6, rays=inputs):
     """The same with embreex alone, one call on one thread; CPU only."""
     if device.type != "cpu":
         return None
-    vertices, faces, origins, directions = inputs(n, subdivisions)
+    vertices, faces, origins, directions = rays(n, subdivisions)
     scene = EmbreeScene(robust=True)
     TriangleMesh(scene, vertices, faces)
     if query == "closest":
@@ -46,8 +47,9 @@ def embree_cast(device, n, query, subdivisions=6):
     return lambda: scene.run(origins, directions, query="OCCLUDED"), {"rays": n}
 
 
-def camera_inputs(size, subdivisions=6):
-    """``size^2`` rays of a camera in order of its rows, before the same mesh, which covers half of the image."""
+def camera_inputs(n, subdivisions):
+    """``n`` rays of a camera in order of its rows, before the same mesh, which covers half of the square image."""
+    size = math.isqrt(n)
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
     pose = look_at(torch.tensor([0.0, 0.5, 2.2]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     origins, directions = (v.reshape(-1, 3).numpy() for v in camera_rays(Camera.from_fov(pose, 1.1, size, size)))
@@ -56,19 +58,12 @@ def camera_inputs(size, subdivisions=6):
 
 def primary(device, size):
     """Closest hits of a camera's rays through :class:`RayScene`: coherent, as embreex likes them."""
-    vertices, faces, origins, directions = (torch.from_numpy(a).to(device) for a in camera_inputs(size))
-    scene = RayScene(vertices, faces)
-    return lambda: scene.closest(origins, directions), {"rays": size * size}
+    return cast(device, size * size, "closest", rays=camera_inputs)
 
 
 def embree_primary(device, size):
     """The same with embreex alone, one call on one thread; CPU only."""
-    if device.type != "cpu":
-        return None
-    vertices, faces, origins, directions = camera_inputs(size)
-    scene = EmbreeScene(robust=True)
-    TriangleMesh(scene, vertices, faces)
-    return lambda: scene.run(origins, directions, query="INTERSECT", output=True), {"rays": size * size}
+    return embree_cast(device, size * size, "closest", rays=camera_inputs)
 
 
 def invalid(device, n, value):

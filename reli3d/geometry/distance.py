@@ -5,6 +5,7 @@ import warp as wp
 from torch import Tensor
 
 from reli3d import _bridge
+from reli3d.geometry.mesh import check_topology
 from reli3d.kernels import distance as kernels
 
 
@@ -15,15 +16,10 @@ def signed_distance(vertices: Tensor, faces: Tensor, points: Tensor) -> Tensor:
     For a mesh with holes, the sign is undefined; a NaN point gives NaN.  Raises TypeError for a wrong dtype, ValueError
     for a wrong shape or device, an empty mesh or an index out of range.
     """
-    _bridge.check("vertices", vertices, shape=("V", 3))
-    _bridge.check("faces", faces, shape=("F", 3), like=vertices, dtype=torch.int32)
+    check_topology(vertices, faces)
     _bridge.check("points", points, shape=("N", 3), like=vertices)
     if len(faces) == 0:
         raise ValueError("faces: expected at least one, got none")
-    if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
-        raise ValueError(
-            f"faces: expected indices 0 to {len(vertices) - 1}, got {int(faces.min())} to {int(faces.max())}"
-        )
     if not torch.isfinite(vertices).all():
         raise ValueError("vertices: expected finite coordinates, got NaN or infinity")
     vertices, faces, points = vertices.detach().contiguous(), faces.contiguous(), points.detach().contiguous()

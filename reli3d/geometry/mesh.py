@@ -44,7 +44,7 @@ class Mesh(Movable):
         for f in fields(self):
             kind = torch.int32 if f.name == "faces" else torch.float32
             object.__setattr__(self, f.name, tensor_of(getattr(self, f.name), kind))
-        _check_topology(self.vertices, self.faces)
+        check_topology(self.vertices, self.faces)
         for name, last in (("normals", 3), ("uv", 2), ("tangents", 4), ("colors", 3)):
             value = getattr(self, name)
             if value is not None:
@@ -81,7 +81,8 @@ class MeshReport:
     manifold: bool = True  # no non-manifold edge or vertex and no flipped edge; a border is allowed
 
 
-def _check_topology(vertices: Tensor, faces: Tensor) -> None:
+def check_topology(vertices: Tensor, faces: Tensor) -> None:
+    """Raises TypeError or ValueError for a wrong dtype, shape or device, or a face index out of range."""
     check("vertices", vertices, shape=("V", 3))
     check("faces", faces, shape=("F", 3), like=vertices, dtype=torch.int32)
     if faces.numel():
@@ -92,7 +93,7 @@ def _check_topology(vertices: Tensor, faces: Tensor) -> None:
 
 def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """Outward face normals ``(F, 3)`` of length twice the area (cross product of two sides).  Differentiable."""
-    _check_topology(vertices, faces)
+    check_topology(vertices, faces)
     a, b, c = (vertices.index_select(0, faces[:, k]) for k in range(3))
     return torch.linalg.cross(b - a, c - a)
 
@@ -145,8 +146,6 @@ def face_components(mesh: Mesh) -> Tensor:
     n = int(faces.max()) + 1
     rows, cols = faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1)
     label = graph_components(rows, cols, n)
-    if not label.any():
-        return torch.zeros(len(faces), dtype=torch.int64, device=mesh.faces.device)
     _, first, inverse = np.unique(label[faces[:, 0]], return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
     return torch.from_numpy(rank[inverse].astype(np.int64)).to(mesh.faces.device)

@@ -13,7 +13,7 @@ from torch import Tensor
 from reli3d._bridge import array_of, check, empty, expect, launch, over_slices, stream, tensor_of
 from reli3d.geometry import embree
 from reli3d.geometry.hits import Hits, evaluate_hits
-from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.mesh import Mesh, check_topology
 from reli3d.kernels import embree as embree_kernels
 from reli3d.kernels import rays as kernels
 
@@ -168,7 +168,8 @@ class RayScene:
 
     def _set_vertices(self, vertices: Tensor) -> None:
         """Keep a copy, once all checks have passed."""
-        check("vertices", vertices, shape=("V", 3), like=self.faces)
+        check("vertices", vertices, like=self.faces)
+        check_topology(vertices, self.faces)
         cells, scale = (wp.vec3(), wp.vec3()), 0.0
         if vertices.numel():
             low, high = vertices.detach().amin(0), vertices.detach().amax(0)
@@ -176,10 +177,6 @@ class RayScene:
             if not scale < float("inf"):
                 raise ValueError("vertices: expected finite coordinates, got NaN or infinity")
             cells = wp.vec3(*low.tolist()), wp.vec3(*(4.0 / (high - low).clamp(min=1e-30)).tolist())
-        if self.faces.numel():
-            first, last = (int(v) for v in torch.aminmax(self.faces))
-            if first < 0 or last >= len(vertices):
-                raise ValueError(f"faces: expected indices in [0, {len(vertices)}), got [{first}, {last}]")
         self.vertices = vertices.detach().clone().contiguous()
         self._cells = cells  # lower corner of the mesh, and quarters of its box per unit
         self.scale = scale  # largest coordinate of the mesh: the step off a face is a multiple of it

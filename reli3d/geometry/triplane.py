@@ -203,12 +203,6 @@ def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
     >>> planes = torch.rand(1, 3, 8, 16, 16, requires_grad=True)
     >>> features = reli3d.sample_triplane(planes, torch.zeros(1, 100, 3))  # (1, 100, 24)
     """
-    check_triplane(planes, points)
-    return _SampleTriplane.apply(planes, points.contiguous())
-
-
-def check_triplane(planes: Tensor, points: Tensor) -> None:
-    """Raises the errors of :func:`sample_triplane` for invalid arguments."""
     if not isinstance(planes, Tensor):
         raise TypeError(f"planes: expected a tensor, got {type(planes).__name__}")
     if planes.dtype not in (torch.float32, torch.bfloat16, torch.float16):
@@ -225,3 +219,4 @@ def check_triplane(planes: Tensor, points: Tensor) -> None:
     largest = 3 * batch * max(height * width * blocks, (height + 2) * blocks, points.shape[1] * blocks)
     if largest >= 2**31:
         raise ValueError(f"planes, points: expected fewer than 2**31 blocks of 8 channels, got {largest}")
+    return _SampleTriplane.apply(planes, points.contiguous())

@@ -6,6 +6,7 @@ The grid ``(X, Y, Z)`` fills the cube [-radius, radius]^3, its outermost points 
 import warp as wp
 
 from reli3d.kernels.bilinear import look_up
+from reli3d.kernels.grid import between_points
 from reli3d.kernels.math import cube_range
 from reli3d.kernels.projection import project_point
 
@@ -19,20 +20,17 @@ INSET_PIXELS = wp.constant(1.0)  # least distance to the silhouette's edge, whos
 @wp.func
 def sdf_at(sdf: wp.array3d[float], cell: wp.vec3) -> float:
     """Trilinear interpolation at ``cell``, a point in units of cells, clamped to the grid."""
-    x = wp.clamp(cell[0], 0.0, float(sdf.shape[0] - 1))
-    y = wp.clamp(cell[1], 0.0, float(sdf.shape[1] - 1))
-    z = wp.clamp(cell[2], 0.0, float(sdf.shape[2] - 1))
-    i = wp.min(int(x), sdf.shape[0] - 2)
-    j = wp.min(int(y), sdf.shape[1] - 2)
-    k = wp.min(int(z), sdf.shape[2] - 2)
-    x -= float(i)
-    y -= float(j)
-    z -= float(k)
-    v00 = wp.lerp(sdf[i, j, k], sdf[i, j, k + 1], z)
-    v01 = wp.lerp(sdf[i, j + 1, k], sdf[i, j + 1, k + 1], z)
-    v10 = wp.lerp(sdf[i + 1, j, k], sdf[i + 1, j, k + 1], z)
-    v11 = wp.lerp(sdf[i + 1, j + 1, k], sdf[i + 1, j + 1, k + 1], z)
-    return wp.lerp(wp.lerp(v00, v01, y), wp.lerp(v10, v11, y), x)
+    x = between_points(cell[0], sdf.shape[0])
+    y = between_points(cell[1], sdf.shape[1])
+    z = between_points(cell[2], sdf.shape[2])
+    i = int(x[0])
+    j = int(y[0])
+    k = int(z[0])
+    v00 = wp.lerp(sdf[i, j, k], sdf[i, j, k + 1], z[1])
+    v01 = wp.lerp(sdf[i, j + 1, k], sdf[i, j + 1, k + 1], z[1])
+    v10 = wp.lerp(sdf[i + 1, j, k], sdf[i + 1, j, k + 1], z[1])
+    v11 = wp.lerp(sdf[i + 1, j + 1, k], sdf[i + 1, j + 1, k + 1], z[1])
+    return wp.lerp(wp.lerp(v00, v01, y[1]), wp.lerp(v10, v11, y[1]), x[1])
 
 
 @wp.func

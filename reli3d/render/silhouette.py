@@ -18,7 +18,7 @@ from torch import Tensor
 
 from reli3d._bridge import check, full_precision
 from reli3d.geometry.camera import Camera, project
-from reli3d.geometry.mesh import weld
+from reli3d.geometry.mesh import check_topology, weld
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.topology import edges_of
 
@@ -47,16 +47,9 @@ def mesh_edges(vertices: Tensor, faces: Tensor) -> Tensor:
     vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  Vertices at identical positions (split by an atlas) are
     merged: the first is listed and receives the gradient.  An edge with three or more faces is listed once per face.
     """
-    check("vertices", vertices, last=3)
-    check("faces", faces, last=3, like=vertices, dtype=torch.int32)
-    if vertices.ndim != 2 or faces.ndim != 2:
-        got = f"{tuple(vertices.shape)}, {tuple(faces.shape)}"
-        raise ValueError(f"vertices, faces: expected (V, 3) and (F, 3), got {got}")
+    check_topology(vertices, faces)
     if faces.numel() == 0:
         return faces.new_empty(0, 4)
-    low, high = (int(v) for v in torch.aminmax(faces))
-    if low < 0 or high >= len(vertices):
-        raise ValueError(f"faces: expected indices in [0, {len(vertices)}), got [{low}, {high}]")
     first, label = weld(vertices)
     corners = first[label[faces.long()]]
     corners = corners[(corners != corners.roll(1, 1)).all(1)]  # a face that welding closes has no edge to show
