@@ -9,12 +9,11 @@ and updates the material at the same mesh's vertices and the texels of the light
 
 from __future__ import annotations
 
-import time
-
 import torch
 import trimesh
 
 from bench.peers.mitsuba_llvm import fit_step, mitsuba
+from bench.timing import Clock
 from reli3d._bridge import present
 from reli3d.fit import losses
 from reli3d.fit.fields import EvenAdam, blurred_grid
@@ -68,20 +67,6 @@ def sky() -> torch.Tensor:
 def detached(tensors) -> list[torch.Tensor]:
     """The values as new leaves: the backward pass of each stage is timed alone."""
     return [t.detach().requires_grad_() for t in tensors]
-
-
-class Clock:
-    """Seconds of named stages; a stage may come twice."""
-
-    def __init__(self, device: torch.device):
-        self.device, self.seconds, self.last = device, {}, time.perf_counter()
-
-    def __call__(self, stage: str) -> None:
-        if self.device.type == "cuda":
-            torch.cuda.synchronize()
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
-        self.last = now
 
 
 def step_of_a_fit(device, size, resolution):

@@ -11,13 +11,13 @@ is cut to a stub that never runs.  The density's output is replaced by the bench
 from __future__ import annotations
 
 import sys
-import time
 from dataclasses import replace
 from functools import lru_cache
 
 import torch
 
 from bench.surface import field
+from bench.timing import Clock
 from reli3d.geometry.camera import Camera
 from reli3d.io.glb import glb_bytes
 from reli3d.nn.field import TriplaneField
@@ -65,20 +65,14 @@ def random_field(device):
 @torch.no_grad()
 def stages(field, resolution, size) -> dict[str, float]:
     """Seconds of each part."""
-    clock = [time.perf_counter()]
-
-    def tick():
-        if field.code.triplane.is_cuda:
-            torch.cuda.synchronize()
-        clock.append(time.perf_counter())
-
+    tick = Clock(field.code.triplane.device)
     mesh = extract(field, resolution)
-    tick()
+    tick("surface")
     mesh, textures = texture(field, mesh, size, None)
-    tick()
+    tick("textures")
     glb_bytes(Asset(mesh, textures))
-    tick()
-    return dict(zip(("surface", "textures", "glb"), (b - a for a, b in zip(clock[:-1], clock[1:]))))
+    tick("glb")
+    return tick.seconds
 
 
 def mesh_stage(device, resolution, size):

@@ -78,6 +78,19 @@ def synchronize(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
+class Clock:
+    """Seconds of named stages; a stage may come twice."""
+
+    def __init__(self, device: torch.device):
+        self.device, self.seconds, self.last = device, {}, time.perf_counter()
+
+    def __call__(self, stage: str) -> None:
+        synchronize(self.device)
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
+        self.last = now
+
+
 def peak_bytes(step: Callable, device: torch.device) -> int | None:
     """Memory that one call of ``step`` needs beyond what is held before it; None where the system does not report it.
 

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d._bridge import present
 from reli3d.eval.metrics import geometry, psnr, ssim, surface_samples
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.mesh import joined
@@ -140,8 +139,7 @@ def evaluate(
     except NoSurface:
         found, result = {"empty": 1.0}, [{k: torch.zeros_like(v) for k, v in w.items()} for w in reference]
     else:
-        light = present("environment", asset.environment)
-        result = [layers(asset, c, light, target.other, (1.0, exposures[1])) for c in unseen]
+        result = [layers(asset, c, asset.light, target.other, (1.0, exposures[1])) for c in unseen]
         mesh = joined([p.mesh for p in target.parts])
         found |= geometry(surface_samples(asset.mesh), surface_samples(mesh, seed=1))
     for name in ("image", "relit", *MAPS):

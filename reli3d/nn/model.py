@@ -1,13 +1,12 @@
 """The network as one module: views in; a triplane that can be queried at points and an environment out."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from reli3d._bridge import mapped
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.nn.blocks import linear_of
 from reli3d.nn.camera import CameraEmbedder, camera_vector
@@ -32,10 +31,6 @@ class Code:
     latent: Tensor  # (B, L, 3) RENI++ latents
     rotation: Tensor  # (B, 3, 3) turns the latents
     strength: Tensor  # (B,) natural logarithm of the radiance factor
-
-    def of(self, b: int) -> "Code":
-        """Object ``b`` alone, as a batch of one."""
-        return mapped(self, lambda values: values[b : b + 1])
 
 
 class Reconstructor(nn.Module):
@@ -72,12 +67,9 @@ class Reconstructor(nn.Module):
 
     def to_compute(self, dtype: torch.dtype) -> "Reconstructor":
         """Cast the trunk (encoders, transformers, upsampler) to ``dtype``, in place; the rest stays float32."""
-        for part in self.trunk():
+        for part in (self.encoder, self.bank, self.backbone, self.upsampler, self.illumination):
             part.to(dtype)
         return self
-
-    def trunk(self) -> Iterator[nn.Module]:
-        yield from (self.encoder, self.bank, self.backbone, self.upsampler, self.illumination)
 
     def encode(
         self,

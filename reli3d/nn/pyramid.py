@@ -65,14 +65,6 @@ def pixel_hull_depths(silhouette: Tensor, outlined: Camera, coverage: Tensor, ca
     return span.new_zeros(*coverage.shape, 2).index_put((v, y, x), span)
 
 
-def pyramid_input(images: Tensor, masks: Tensor, place: Tensor, span: Tensor, counts: Sequence[int]) -> Tensor:
-    """Input of the first convolution, ``(V, INPUTS, S, S)``; arguments as in :meth:`ImagePyramid.forward`."""
-    inverse = torch.cat([masks.new_full((count,), 1.0 / count) for count in counts])
-    inverse = inverse[:, None, None, None].expand(*masks.shape, 1)
-    x = torch.cat([images * masks[..., None], masks[..., None], place, inverse], -1).permute(0, 3, 1, 2)
-    return torch.cat([x, functional.interpolate(span.permute(0, 3, 1, 2), size=x.shape[-2:], mode="nearest")], 1)
-
-
 class ImagePyramid(nn.Module):
     """Features of every view at a quarter of its resolution and predictions at half.
 
@@ -126,7 +118,10 @@ class ImagePyramid(nn.Module):
         number of views of each object, in order; None if all are of one object.
         """
         counts = [len(masks)] if counts is None else counts
-        x = pyramid_input(images, masks, place, span, counts)
+        inverse = torch.cat([masks.new_full((count,), 1.0 / count) for count in counts])
+        inverse = inverse[:, None, None, None].expand(*masks.shape, 1)
+        x = torch.cat([images * masks[..., None], masks[..., None], place, inverse], -1).permute(0, 3, 1, 2)
+        x = torch.cat([x, functional.interpolate(span.permute(0, 3, 1, 2), size=x.shape[-2:], mode="nearest")], 1)
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):
             quarter, pixels = self._convolved(x, counts)
             features = self.features(quarter) if self.finest == 0 else None

@@ -155,24 +155,14 @@ class EnvironmentDecoder(nn.Module):
             directions = quarter_turn(reni_frame(lat_long_directions(sizes.height)), 1).flatten(0, 1)
         self.register_buffer("sample_directions", directions)
 
-    def forward(
-        self,
-        latent: Tensor,
-        rotation: Tensor,
-        strength: Tensor,
-        height: int | None = None,
-        *,
-        z_rotation: Tensor | None = None,
-    ) -> Tensor:
+    def forward(self, latent: Tensor, rotation: Tensor, strength: Tensor, height: int | None = None) -> Tensor:
         """Linear radiance ``(B, H, 2H, 3)``, upper edge +Y, horizontal center +X.
 
         latent: ``(B, L, 3)``.  rotation: ``(B, 3, 3)`` applied to every latent.  strength: ``(B,)``, natural logarithm
-        of a factor.  z_rotation: ``(B,)`` radians; rotates the map by twice this angle, as published.
+        of a factor.
         """
         height = height or self.height
         directions = reni_frame(lat_long_directions(height, device=latent.device)).reshape(1, -1, 3)
-        if z_rotation is not None:
-            directions = directions @ _turn(-2.0 * z_rotation)
         radiance = self.radiance(latent, rotation, strength, directions)
         return radiance.unflatten(1, (height, 2 * height))
 
@@ -182,12 +172,6 @@ class EnvironmentDecoder(nn.Module):
             turned = latent.float() @ rotation.float().transpose(1, 2)
             log_radiance = self.field(turned, directions.float())
             return truncated_exp(log_radiance) * truncated_exp(strength.float())[:, None, None]
-
-
-def _turn(angle: Tensor) -> Tensor:
-    """``(B,)`` to ``(B, 3, 3)``: rows ``(c, -s, 0), (s, c, 0), (0, 0, 1)``."""
-    c, s, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
-    return torch.stack([c, -s, zero, s, c, zero, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
 
 
 def rotation_from_6d(d: Tensor) -> Tensor:

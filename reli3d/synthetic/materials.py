@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -82,16 +81,14 @@ class Material:
         return color.clamp(*ALBEDO_RANGE), roughness.clamp(*ROUGHNESS_RANGE), value[:, 4].clamp(0, 1), bumped
 
 
-def evaluate(materials: Sequence[Material], points, normals, part):
+def evaluate(
+    materials: Sequence[Material], points: Tensor, normals: Tensor, part: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Evaluates the materials at ``points (N, 3)`` with unit ``normals (N, 3)`` and material indices ``part (N,)``.
 
     Returns base color ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)`` and bump-mapped normal ``(N, 3)``, float32.
-    Arguments are all tensors on one device or all numpy arrays; the results are of the same type.  Raises TypeError
-    unless float32, ValueError for a wrong shape or index.
+    Raises TypeError unless float32, ValueError for a wrong shape or index.
     """
-    as_array = isinstance(points, np.ndarray)
-    if as_array:
-        points, normals, part = (torch.from_numpy(np.ascontiguousarray(x)) for x in (points, normals, part))
     for name, value in (("points", points), ("normals", normals)):
         if value.dtype != torch.float32:
             raise TypeError(f"{name}: expected float32, got {value.dtype}")
@@ -104,5 +101,4 @@ def evaluate(materials: Sequence[Material], points, normals, part):
     for k in torch.bincount(part, minlength=1).nonzero()[:, 0].tolist():
         rows = (part == k).nonzero()[:, 0]
         color[rows], roughness[rows], metallic[rows], bumped[rows] = materials[k].at(points[rows], normals[rows])
-    results = color, roughness, metallic, bumped
-    return tuple(r.numpy() for r in results) if as_array else results
+    return color, roughness, metallic, bumped

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from reli3d.geometry.camera import look_at
+from reli3d.geometry.topology import graph_components
 from reli3d.synthetic import furniture, manmade, organic, vessels
 from reli3d.synthetic.assembly import ON_BACK, ON_SIDE, Assembly
 from reli3d.synthetic.finishes import draw_materials
-from reli3d.synthetic.materials import Material, evaluate
+from reli3d.synthetic.materials import Material
 
 VALIDATION_SEEDS = range(1_000_000_000, 1_000_000_032)  # seeds of training objects are smaller
 TEST_SEEDS = range(1_000_000_032, 1_000_000_064)
@@ -55,10 +54,6 @@ class ProceduralObject:
     part: np.ndarray  # (F,) int32 index into materials
     materials: tuple[Material, ...]
     name: str  # of the family
-
-    def material(self, points: np.ndarray, normals: np.ndarray, part: np.ndarray):
-        """:func:`~reli3d.synthetic.materials.evaluate` of the object's materials at surface points."""
-        return evaluate(self.materials, points, normals, part)
 
 
 def make_object(seed: int) -> ProceduralObject:
@@ -126,10 +121,9 @@ def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = 
     smooth |= (area[half // 3] < 1e-12) | (area[opposite // 3] < 1e-12)
     smooth &= found  # an open border has no other side
     here, there = half[smooth], (opposite - opposite % 3 + (opposite + 1) % 3)[smooth]
-    graph = coo_matrix((np.ones(len(here), dtype=np.int8), (here, there)), shape=(3 * count, 3 * count))
-    groups, label = connected_components(graph, directed=False)
+    label = graph_components(here, there, 3 * count)
     weight = np.repeat(normal * area[:, None], 3, axis=0) * angle.reshape(-1, 1)
-    total = np.stack([np.bincount(label, weights=weight[:, k], minlength=groups) for k in range(3)], -1)
+    total = np.stack([np.bincount(label, weights=weight[:, k], minlength=3 * count) for k in range(3)], -1)
     size = np.linalg.norm(total, axis=1, keepdims=True)
     flat = np.repeat(normal, 3, axis=0)
     result = np.where(size[label] > 1e-20, total[label] / np.maximum(size[label], 1e-20), flat)

@@ -21,6 +21,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.latlong import quarter_turn
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
+from reli3d.synthetic.materials import evaluate
 from reli3d.synthetic.procedural import ProceduralObject, sample_cameras
 
 SAMPLES = (4, 3, 1)  # light, GGX and cosine samples per ray; with FINE**2 rays per pixel the noise is a photograph's
@@ -79,9 +80,8 @@ class ObjectSurface:
             functional.normalize((self.corner_normals[face] * weights).sum(1), dim=-1),
         )
         position = (corners * weights).sum(1)
-        base, rough, metal, bump = self.shape.material(position.numpy(), normal.numpy(), self.part[face].numpy())
-        as_float = lambda x: torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)  # noqa: E731
-        return SurfacePoints(position, ng, *map(as_float, (bump, base, rough, metal)))
+        base, rough, metal, bump = evaluate(self.shape.materials, position, normal, self.part[face])
+        return SurfacePoints(position, ng, bump, base, rough, metal)
 
 
 def _render(surface: Surface, camera: Camera, light: Environment, seed: int):

@@ -49,6 +49,13 @@ def finish_known(file: safe_open) -> Tensor:
     return torch.ones_like(file.get_tensor("c2w")[:, 0, 0], dtype=torch.bool)
 
 
+def valid_means(values: Tensor, valid: Tensor, factor: int) -> Tensor:
+    """Means ``(V, H/f, W/f, C)`` of ``values (V, H, W, C)`` over the valid pixels of squares of ``factor``."""
+    fraction = functional.avg_pool2d(valid.float()[:, None], factor)
+    means = functional.avg_pool2d((values * valid[..., None]).permute(0, 3, 1, 2), factor) / fraction.clamp(min=0.25)
+    return means.permute(0, 2, 3, 1)
+
+
 @dataclass(frozen=True)
 class TrainingViews:
     """``V`` views of ``S`` by ``S`` pixels with ground-truth maps of ``P = S/2`` pixels; float32."""
@@ -163,13 +170,6 @@ def load_sample(
         source = torch.Generator(device).manual_seed(int(rng.integers(1 << 62)))
         noise = torch.randn(color.shape, generator=source, device=device)
         color = (color + float(rng.random()) * MAX_NOISE * noise).clamp(0, 1)
-    whole = functional.avg_pool2d(valid.float()[:, None], 2)[:, 0]
-    fraction = whole.clamp(min=0.25)[..., None]
-
-    def half(values: Tensor) -> Tensor:
-        pooled = functional.avg_pool2d((values * valid[..., None]).permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1)
-        return pooled / fraction
-
     mirrors = Camera(c2w[:0], intrinsics[:0], *masks.shape[:0:-1])
     if plane is not None:
         normal = turn @ torch.as_tensor(plane[0], dtype=torch.float32, device=device)
@@ -181,10 +181,10 @@ def load_sample(
         silhouette=mask_distance(masks.contiguous()),
         c2w=c2w,
         intrinsics=intrinsics,
-        view_material=half(of_pixels),
-        view_normal=functional.normalize(half(normal) @ turn.T, dim=-1),
-        view_depth=half(depth[..., None])[..., 0] - origin,
-        view_valid=whole > 0.99,
+        view_material=valid_means(of_pixels, valid, 2),
+        view_normal=functional.normalize(valid_means(normal, valid, 2) @ turn.T, dim=-1),
+        view_depth=valid_means(depth[..., None], valid, 2)[..., 0] - origin,
+        view_valid=functional.avg_pool2d(valid.float()[:, None], 2)[:, 0] > 0.99,
         finish_known=known,
         points=volume @ turn.T,
         distance=distance,

@@ -85,7 +85,7 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
     InputError for a batch size that the processes do not divide and for a checkpoint of another stage.
     """
     workers = workers or Workers()
-    model, folder, first = stage.model, Path(options.output), workers is None or workers.rank == 0
+    model, folder, first = stage.model, Path(options.output), workers.rank == 0
     if options.batch % workers.count:
         raise InputError("batch", f"expected a multiple of the {workers.count} processes, got {options.batch}")
     folder.mkdir(parents=True, exist_ok=True)

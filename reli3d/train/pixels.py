@@ -19,7 +19,7 @@ from reli3d.geometry.hull import mask_distance
 from reli3d.nn.local import QUARTER, LocalReconstructor, PixelMaps, mean_logit, pixel_colors
 from reli3d.nn.presets import LocalPreset
 from reli3d.nn.pyramid import ImagePyramid, pixel_hull_depths, pixel_positions
-from reli3d.train.batches import MAX_NOISE, UNCHANGED_PROBABILITY, TrainingViews, finish_known
+from reli3d.train.batches import MAX_NOISE, UNCHANGED_PROBABILITY, TrainingViews, finish_known, valid_means
 
 FULL_SIDE = 256  # pixels of an image at the finest level
 CACHE_BYTES = 1 << 31  # of small images in the memory of a process
@@ -106,13 +106,7 @@ def read_views_reduced(path: Path, factor: int, device: torch.device | str = "cp
         images, material, normal, depth, c2w, intrinsics = (file.get_tensor(name).float() for name in names)
         known = finish_known(file)
     images = functional.avg_pool2d(images.permute(0, 3, 1, 2) / 255, factor).permute(0, 2, 3, 1).contiguous()
-    valid = (depth > 0).float()[:, None]
-    fraction = functional.avg_pool2d(valid, 2 * factor)
-
-    def pooled(values: Tensor) -> Tensor:
-        mean = functional.avg_pool2d(values.permute(0, 3, 1, 2) * valid, 2 * factor) / fraction.clamp(min=0.25)
-        return mean.permute(0, 2, 3, 1)
-
+    valid = depth > 0
     origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # depth of the world's origin
     masks = images[..., 3].contiguous()
     return TrainingViews(
@@ -121,10 +115,10 @@ def read_views_reduced(path: Path, factor: int, device: torch.device | str = "cp
         silhouette=mask_distance(masks),
         c2w=c2w,
         intrinsics=intrinsics / factor,
-        view_material=pooled(material / 255),
-        view_normal=functional.normalize(pooled(normal), dim=-1),
-        view_depth=pooled(depth[..., None])[..., 0] - origin,
-        view_valid=fraction[:, 0] > 0.99,
+        view_material=valid_means(material / 255, valid, 2 * factor),
+        view_normal=functional.normalize(valid_means(normal, valid, 2 * factor), dim=-1),
+        view_depth=valid_means(depth[..., None], valid, 2 * factor)[..., 0] - origin,
+        view_valid=functional.avg_pool2d(valid.float()[:, None], 2 * factor)[:, 0] > 0.99,
         finish_known=known,
     )
 

@@ -77,8 +77,8 @@ def test_a_batch_is_its_objects():
     both = model.encode(*inputs)
     for b in range(2):
         alone = model.encode(*(t[b : b + 1] for t in inputs))
-        torch.testing.assert_close(both.of(b).triplane, alone.triplane, rtol=1e-4, atol=1e-6)
-        torch.testing.assert_close(both.of(b).latent, alone.latent, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(both.triplane[b : b + 1], alone.triplane, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(both.latent[b : b + 1], alone.latent, rtol=1e-4, atol=1e-6)
 
 
 def test_gradients_reach_every_parameter_that_has_an_effect(device):

@@ -51,7 +51,10 @@ def test_intermediate_features_match_published(decoder, golden):
 @torch.no_grad()
 def test_map_turned_about_the_vertical_matches_published(decoder, golden):
     g = golden("reni_decoder_zrot")
-    out = decoder(g["latent"], g["rotation"], g["strength"], z_rotation=g["z_rotation_rads"].reshape(1))
+    c, s = (f(-2.0 * float(g["z_rotation_rads"])) for f in (math.cos, math.sin))  # as published, by twice the angle
+    directions = reni_frame(lat_long_directions(decoder.height)).reshape(1, -1, 3)
+    turned = directions @ torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    out = decoder.radiance(g["latent"], g["rotation"], g["strength"], turned).unflatten(1, (decoder.height, -1))
     torch.testing.assert_close(quarter_turn(out, 1), g["env_map"], **MAP)
 
 

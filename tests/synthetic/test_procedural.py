@@ -8,6 +8,7 @@ import trimesh
 from reli3d.geometry.distance import signed_distance
 from reli3d.synthetic import primitives
 from reli3d.synthetic.assembly import Assembly
+from reli3d.synthetic.materials import evaluate
 from reli3d.synthetic.noise import cells, fbm
 from reli3d.synthetic.organic import surface_nets
 from reli3d.synthetic.procedural import (
@@ -60,10 +61,14 @@ def test_shading_normals_are_unit_and_leave_the_surface(objects):
         assert mesh.area_faces[cosine < 0.3].sum() < 0.02 * mesh.area, shape.name
 
 
+def material_at(shape, points, normals, part, device="cpu"):
+    return evaluate(shape.materials, *(torch.from_numpy(x).to(device) for x in (points, normals, part)))
+
+
 def test_materials_are_finite_and_in_range(objects):
     for k, shape in enumerate(objects):
         points, normals, part = surface_points(shape, 2000, k)
-        color, roughness, metallic, bumped = shape.material(points, normals, part)
+        color, roughness, metallic, bumped = (x.numpy() for x in material_at(shape, points, normals, part))
         assert color.shape == (2000, 3) and roughness.shape == metallic.shape == (2000,) and bumped.shape == (2000, 3)
         assert all(x.dtype == np.float32 and np.isfinite(x).all() for x in (color, roughness, metallic, bumped))
         # the limits are rounded to float32
@@ -79,8 +84,8 @@ def test_an_object_is_the_same_from_the_same_seed():
         assert np.array_equal(one.vertices, two.vertices) and np.array_equal(one.faces, two.faces)
         assert np.array_equal(one.normals, two.normals) and np.array_equal(one.part, two.part)
         points, normals, part = surface_points(one, 500, seed)
-        for x, y in zip(one.material(points, normals, part), two.material(points, normals, part)):
-            assert np.array_equal(x, y)
+        for x, y in zip(material_at(one, points, normals, part), material_at(two, points, normals, part)):
+            assert torch.equal(x, y)
 
 
 def test_seed_ranges_are_disjoint_and_the_validation_objects_exist():
@@ -103,25 +108,24 @@ def test_every_family_makes_solids(family):
     assert made >= 3
 
 
-def test_tensors_and_arrays_give_the_same_material(device):
+def test_every_device_gives_the_same_material(device):
     shape = make_object(505)
     points, normals, part = surface_points(shape, 3000, 0)
-    arrays = shape.material(points, normals, part)
-    tensors = shape.material(*(torch.from_numpy(x).to(device) for x in (points, normals, part)))
-    for x, y in zip(arrays, tensors):
+    on_cpu, there = (material_at(shape, points, normals, part, on) for on in ("cpu", device))
+    for x, y in zip(on_cpu, there):
         # the same kernels; on a GPU other roundings move a border of a pattern by some ulp, which few points see
-        assert (np.abs(x - y.cpu().numpy()) > 1e-3).mean() < 5e-3
+        assert ((x - y.cpu()).abs() > 1e-3).float().mean() < 5e-3
 
 
 def test_material_refuses_wrong_arguments():
     shape = make_object(505)
     points, normals, part = surface_points(shape, 10, 0)
     with pytest.raises(TypeError, match="points: expected float32"):
-        shape.material(points.astype(np.float64), normals, part)
+        material_at(shape, points.astype(np.float64), normals, part)
     with pytest.raises(ValueError, match="normals: expected shape"):
-        shape.material(points, normals[:5], part)
+        material_at(shape, points, normals[:5], part)
     with pytest.raises(ValueError, match="part: expected 0 to"):
-        shape.material(points, normals, part + 100)
+        material_at(shape, points, normals, part + 100)
     with pytest.raises(ValueError, match="seed: expected at least 0"):
         make_object(-1)
 

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, binary_cross_entropy
 
-from reli3d._bridge import present
 from reli3d.errors import InputError
 from reli3d.train.stages.rendering import Rendering
 from reli3d.train.stages.views import ObjectViews
@@ -130,7 +129,5 @@ def light_terms(latent: Tensor, rotation: Tensor, strength: Tensor, radiance: Te
         mean = radiance.mean(-1, keepdim=True)
         return {"neutral": (radiance - mean).abs().mean() / mean.detach().mean().clamp(min=1e-3)}
     turned = latent @ rotation.T
-    difference = torch.cat(
-        [(turned - target.latent).reshape(-1), (strength - present("strength", target.strength)).reshape(1)]
-    )
+    difference = torch.cat([(turned - target.latent).reshape(-1), (strength - target.strength).reshape(1)])
     return {"latent": difference.square().mean()}

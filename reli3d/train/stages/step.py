@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from reli3d.fit.shading import DIFFUSE_MODEL
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.model import Code, Reconstructor
@@ -19,8 +20,6 @@ from reli3d.train.stages.rendering import Rendering, lobes
 from reli3d.train.stages.surface import Shader, render_surface, seed_surface, surface
 from reli3d.train.stages.views import Draw
 from reli3d.train.stages.volume import occupied, render_volume
-
-DIFFUSE_MODEL = "published"  # the formula of the images of reli3d.synthetic.samples
 
 
 def encode(model: Reconstructor, drawn: Draw, *, bfloat16: bool = False) -> Code:

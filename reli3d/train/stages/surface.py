@@ -66,7 +66,8 @@ def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None
     axis = torch.linspace(-radius, radius, resolution + 1, device=code.latent.device)
     points = torch.cartesian_prod(axis, axis, axis)
     with torch.no_grad():
-        free = model.sdf(_densities(model, code, points)).view((resolution + 1,) * 3) / threshold
+        density = query_heads(model, code, points, ("density",))["density"][:, 0]
+        free = model.sdf(density).view((resolution + 1,) * 3) / threshold
         cubes = surface_cubes(free)
         if len(cubes) == 0:
             return None
@@ -88,11 +89,6 @@ def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None
     }
     scene = RayScene(mesh.vertices.detach(), mesh.faces)
     return Surface(mesh, scene, mesh_edges(mesh.vertices.detach(), mesh.faces), terms)
-
-
-def _densities(model: Reconstructor, code: Code, points: Tensor) -> Tensor:
-    parts = [model.query(code, part[None], ("density",))["density"][0, :, 0] for part in points.split(CHUNK)]
-    return torch.cat(parts)
 
 
 def seed_surface(model: Reconstructor, code: Code) -> Tensor:
