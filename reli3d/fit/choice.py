@@ -51,9 +51,8 @@ UNCHANGED = Parts(0.0, 0.0, 0.0)
 # Weights of material and lighting in the order of trial.  Relighting shows surface and material but not the estimated
 # lighting, so the lighting is reduced first.  Fitted material without any of the lighting fitted with it is not tried.
 CANDIDATES = ((1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 0.5), (0.0, 0.0))
-MIN_VIEWS_FULL_WEIGHT = (
-    4  # with fewer input views the material's weight, and with a held-out view the light's, is <= 0.5
-)
+# With fewer input views the material's weight, and with a held-out view the light's, is <= 0.5.
+MIN_VIEWS_FULL_WEIGHT = 4
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,12 @@
-"""Multiresolution fields: sums of grids or lat-long maps, smoothing of gradients, and the optimizer of the surface."""
+"""Multiresolution fields: sums of grids, smoothing of gradients, and the optimizer of the surface."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate, pad
+from torch.nn.functional import interpolate
 
 from reli3d.geometry.grid import sample_grid
 
@@ -18,21 +17,6 @@ def space_field(grids: Sequence[Tensor], points: Tensor) -> Tensor:
     An optimizer step on a coarse grid changes whole regions, so the coarse grids converge to the low frequencies.
     """
     return torch.stack([sample_grid(grid.contiguous(), points) for grid in grids]).sum(0)
-
-
-def light_field(maps: Sequence[Tensor], height: int) -> Tensor:
-    """Sum ``(height, 2 height, 3)`` of lat-long maps, coarse to fine; bilinear and periodic in azimuth."""
-    parts = []
-    for values in maps:
-        planes = values.permute(2, 0, 1)[None]
-        rows = planes.shape[2]
-        if rows != height:
-            factor = height // rows
-            planes = pad(planes, (1, 1, 0, 0), mode="circular")
-            planes = interpolate(planes, scale_factor=factor, mode="bilinear", align_corners=False)
-            planes = planes[..., factor:-factor]
-        parts.append(planes[0].permute(1, 2, 0))
-    return reduce(torch.add, parts)
 
 
 def blurred_grid(grid: Tensor, cells: int) -> Tensor:

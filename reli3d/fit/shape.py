@@ -82,9 +82,8 @@ def start_sdf(mesh: Mesh, grid: Grid) -> Tensor:
     coarse = signed_distance(mesh.vertices, mesh.faces, torch.cartesian_prod(*axes)).reshape(few)
     sdf = interpolate(coarse[None, None], grid.shape, mode="trilinear", align_corners=True)[0, 0].contiguous()
     spacing = max(2.0 * r / (n - 1) for r, n in zip(grid.radius, few))
-    near = (
-        sdf.abs() < BAND_CELLS * grid.cell + spacing
-    )  # interpolation errors are below half the coarse cell's diagonal
+    # interpolation errors are below half the coarse cell's diagonal
+    near = sdf.abs() < BAND_CELLS * grid.cell + spacing
     sdf[near] = signed_distance(mesh.vertices, mesh.faces, at[near])
     return sdf
 

@@ -7,12 +7,13 @@ metallic; logarithms of radiance): zero is the start, and every value is valid.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import interpolate, normalize, pad
 
-from reli3d.fit.fields import light_field, space_field
+from reli3d.fit.fields import space_field
 from reli3d.geometry.bake import rasterize_texels
 from reli3d.geometry.camera import Camera
 from reli3d.render.asset import Asset
@@ -125,8 +126,16 @@ def bent(unknowns: Unknowns, position: Tensor, normal: Tensor) -> tuple[Tensor, 
 
 
 def light_maps(light: list[Tensor]) -> Tensor:
-    """Changes of log radiance ``(G, LIGHT_ROWS, 2 LIGHT_ROWS, 3)`` of the lightings."""
-    return torch.stack([light_field([maps[k] for maps in light], LIGHT_ROWS) for k in range(len(light[0]))])
+    """Changes of log radiance ``(G, LIGHT_ROWS, 2 LIGHT_ROWS, 3)``: sum of the maps, bilinear, periodic in azimuth."""
+    parts = []
+    for values in light:
+        planes, factor = values.permute(0, 3, 1, 2), LIGHT_ROWS // values.shape[1]
+        if factor > 1:
+            planes = pad(planes, (1, 1, 0, 0), mode="circular")
+            planes = interpolate(planes, scale_factor=factor, mode="bilinear", align_corners=False)
+            planes = planes[..., factor:-factor]
+        parts.append(planes.permute(0, 2, 3, 1))
+    return reduce(torch.add, parts).contiguous()
 
 
 def corrected(camera: Camera, pose: Tensor) -> Camera:
