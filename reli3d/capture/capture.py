@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from reli3d.capture.fusion import fused_masks
+from reli3d.capture.fusion import fused_masks, shown_pixels
 from reli3d.capture.mapping import Map, View, map_photos
 from reli3d.capture.masks import grabcut_mask, is_empty, key_mask, moving_region, touches_border
 from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
@@ -280,10 +280,9 @@ def _without_moving(
 
 def _still_region(view: View, support: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     """``(H, W)`` uint8, 255 inside the mask and at the points ``support (N, 3)``."""
-    width, height = view.photo.size
-    pixels, depth = view.project(support)
-    x, y = pixels[(depth > 0) & ((pixels >= 0) & (pixels < (width, height))).all(1)].astype(int).T
-    region = np.zeros((height, width), np.uint8) if mask is None else mask.copy()
+    shape = view.photo.size[::-1]
+    x, y, _ = shown_pixels(*view.project(support), shape)
+    region = np.zeros(shape, np.uint8) if mask is None else mask.copy()
     region[y, x] = 255
     return region
 
@@ -301,7 +300,8 @@ def _refined(
     Otherwise masks that disagree are fused.
     """
     first = segmented.found
-    up = scene.plane.normal if scene.plane else _mean_up(first)
+    down = np.stack([v.rotation[1] for v in first.views]).mean(0)
+    up = scene.plane.normal if scene.plane else -down / max(np.linalg.norm(down), 1e-9)
     ground = -scene.plane.offset if scene.plane else None
     report.epipolar_fit = epipolar_fit(first, segmented.masks)
     consistent = _agreement(segmented.views, segmented.masks) > SURE_AGREEMENT
@@ -357,11 +357,6 @@ def _refined(
     similar = directions @ directions.T > SAME_UP  # an object that was turned over has two: that of most views is up
     upward = directions[similar[similar.sum(1).argmax()]].mean(0)
     return refined, upward / np.linalg.norm(upward), None
-
-
-def _mean_up(found: Map) -> np.ndarray:
-    up = -np.stack([v.rotation[1] for v in found.views]).mean(0)
-    return up / max(np.linalg.norm(up), 1e-9)
 
 
 def _c2w(view: View) -> np.ndarray:

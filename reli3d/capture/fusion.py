@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from reli3d.capture.mapping import Map, View
+from reli3d.capture.mapping import Map, View, grown
 from reli3d.capture.masks import COARSE_SIDE, full_size, grabcut, reduced, refined
 from reli3d.capture.scene import Scene
 
@@ -125,7 +125,7 @@ def _plane_texture(
     count = int(2 * TEXTURE_REACH * scene.distance / cell)
     at = (np.arange(count) + 0.5 - count / 2) * cell
     hidden = [
-        np.where(_grown(c, COVER_MARGIN) > 0, np.uint8(2), _grown(m, MASK_MARGIN))
+        np.where(grown(c, COVER_MARGIN) > 0, np.uint8(2), grown(m, MASK_MARGIN))
         for m, c in zip(inside, cover, strict=True)
     ]
     coarse, _ = _plane_samples(smalls, hidden, axes, at[::GAIN_STEP], at[::GAIN_STEP])
@@ -143,11 +143,6 @@ def _plane_texture(
         color[rows] = np.nan_to_num(middle)
         spread[rows] = np.where(known, np.maximum(deviation, LEAST_SPREAD), 10 * MOST_SPREAD)
     return _Texture(cell, color, spread)
-
-
-def _grown(mask: np.ndarray, margin: float) -> np.ndarray:
-    size = 2 * round(margin * max(mask.shape)) + 1
-    return cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
 
 
 def _plane_samples(
@@ -271,7 +266,9 @@ def _log_odds(image: np.ndarray, inside: np.ndarray, plane: _Expected, own: _Col
     return np.clip(cv2.GaussianBlur(np.clip(odds, -8, 8), (0, 0), 1.2), -limit, limit).astype(np.float32)
 
 
-def _shown(pixels: np.ndarray, depth: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def shown_pixels(
+    pixels: np.ndarray, depth: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Column and row of the pixels inside an image of ``shape``, and which of ``pixels (N, 2)`` these are ``(N,)``."""
     x, y = np.floor(pixels).astype(np.int64).T
     shown = (depth > 0) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
@@ -290,7 +287,7 @@ def _occupied(smalls, evidence, axes: _Axes, box, points, cells: int, growth: fl
     open_cells = (grid[..., 2].ravel() > 0).nonzero()[0]
     for k, (small, e) in enumerate(zip(smalls, evidence, strict=True), 1):
         pixels, depth = small.project(flat[open_cells])
-        x, y, shown = _shown(pixels, depth, e.shape)
+        x, y, shown = shown_pixels(pixels, depth, e.shape)
         odds[open_cells[shown]] -= np.log(COVERED + (1 - COVERED) * np.exp(-e[y, x]))
         seen[open_cells] += shown
         most_added = -np.log(COVERED) * (len(smalls) - k)  # by the views to come
@@ -313,7 +310,7 @@ def _occupied(smalls, evidence, axes: _Axes, box, points, cells: int, growth: fl
 def _silhouette(small: _Small, centers: np.ndarray, cell: float) -> np.ndarray:
     """``(H, W)`` uint8, 255 where the view shows the cells of size ``cell`` about ``centers (N, 3)``."""
     pixels, depth = small.project(centers)
-    x, y, shown = _shown(pixels, depth, small.image.shape)
+    x, y, shown = shown_pixels(pixels, depth, small.image.shape)
     silhouette = np.zeros(small.image.shape[:2], np.uint8)
     silhouette[y, x] = 255
     if len(x) == 0:

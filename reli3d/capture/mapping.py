@@ -30,7 +30,7 @@ EXHAUSTIVE = 100  # images up to which each is matched with each
 SEED = 0
 DEFAULT_FOCAL = 1.2  # of the longer side, where EXIF has none: a phone's main camera, and COLMAP's own default
 LENS_STEPS = 8  # fixed-point iterations that undo the distortion of a lens
-MASK_MARGIN = 0.01  # of the longer side, by which masks are grown before features are limited to them
+MASK_MARGIN = 0.01  # of the longer side, by which masks are grown: features sit on the outline too
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
         scales[path], by_path[path] = min(1.0, side / max(photo.size)), photo
         _write(images / path, photo.pixels, scales[path])
         if masks is not None:
-            _write(work / "masks" / f"{path}.png", _grown(masks[k]), scales[path])
+            _write(work / "masks" / f"{path}.png", 255 * grown(masks[k] > 0, MASK_MARGIN), scales[path])
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features, extraction.sift.peak_threshold = FEATURES, LOW_PEAK
     pycolmap.Database.open(database).close()
@@ -238,10 +238,10 @@ def _write(path: Path, pixels: np.ndarray, scale: float) -> None:
         raise OSError(f"{path}: cannot be written")
 
 
-def _grown(mask: np.ndarray) -> np.ndarray:
-    """``mask`` grown by MASK_MARGIN: features sit on the object's outline too."""
-    size = 2 * round(MASK_MARGIN * max(mask.shape)) + 1
-    return cv2.dilate((mask > 0).astype(np.uint8) * 255, np.ones((size, size), np.uint8))
+def grown(mask: np.ndarray, margin: float) -> np.ndarray:
+    """``mask`` dilated by ``margin``, relative to its longer side, as uint8."""
+    size = 2 * round(margin * max(mask.shape)) + 1
+    return cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
 
 
 def _read_model(model, database, by_path: dict[str, Photo], scales: dict[str, float]) -> Map:

@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from reli3d.capture.mapping import View
+from reli3d.views.check import latin
 
 THUMBNAIL, PANEL, MARGIN, COLUMNS = 160, 480, 8, 6
 MOST_POINTS = 4000
@@ -35,9 +36,7 @@ def contact_sheet(
     for k, (name, pixels, mask, view) in enumerate(images):
         at = MARGIN + k % COLUMNS * (THUMBNAIL + MARGIN), PANEL + 50 + k // COLUMNS * (THUMBNAIL + 22)
         sheet.paste(_thumbnail(pixels, mask, view, to_map(some[::8])), at)
-        draw.text(
-            (at[0], at[1] + THUMBNAIL + 2), name[-24:].encode("latin-1", "replace").decode("latin-1"), fill="black"
-        )
+        draw.text((at[0], at[1] + THUMBNAIL + 2), latin(name[-24:]), fill="black")
     return sheet
 
 

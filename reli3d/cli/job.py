@@ -16,6 +16,7 @@ from reli3d.errors import printable
 from reli3d.kernels import cache
 from reli3d.nn import weights
 from reli3d.output import results
+from reli3d.output.folder import claimed
 from reli3d.pipeline import FolderOptions, Progress, ReconstructOptions, reconstruct_folder
 
 STAGES = (
@@ -47,7 +48,11 @@ class FolderJob:
         path = weights.locate(args.weights)
         trunk = args.precision if args.precision in (None, "auto") else getattr(torch, args.precision)
         self.model, manifest = weights.load(path, trunk=trunk, device=device)
-        self.weights = results.weights_record(manifest, weights.known_sha256(path))
+        self.weights = {
+            "file": Path(manifest.path).name,
+            "sha256": weights.known_sha256(path),
+            "license": manifest.license,
+        }
         self.skip = args.skip_existing
         if budget:
             import reli3d.fit.refine  # noqa: F401 # its kernels are compiled with the others
@@ -56,7 +61,7 @@ class FolderJob:
     def run(self, folder: Path, name: str, target: Path) -> str:
         """Reconstructs one object and writes its files; with --skip-existing only if they are missing."""
         interrupt_flag.clear()
-        with results.claim(target) as replacing:
+        with claimed(target, results.OURS) as replacing:
             if self.skip and results.complete(target, refined=bool(self.reading.budget)):
                 return "skipped"
             with Bar(name) as bar:

@@ -3,7 +3,6 @@
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
@@ -22,8 +21,6 @@ from reli3d.io.glb import glb_bytes
 from reli3d.io.hdr import write_environment
 from reli3d.io.images import png_bytes, write_png
 from reli3d.nn.blocks import submit
-from reli3d.nn.weights import Manifest
-from reli3d.output.folder import claimed
 from reli3d.output.viewer import Shown, photograph_stops, shadow, viewer_page
 from reli3d.render.asset import Asset
 from reli3d.views.similarity import Similarity
@@ -38,11 +35,6 @@ OURS = (*FILES, COMPARISON, "illumination.hdr")  # removed from the folder of an
 def complete(folder: Path, *, refined: bool = False) -> bool:
     """Whether ``folder`` holds every file of a reconstruction."""
     return all((folder / name).is_file() for name in (*FILES, *([COMPARISON] if refined else [])))
-
-
-def claim(folder: Path) -> AbstractContextManager[Callable]:
-    """Reserves ``folder`` for one result: :func:`~reli3d.output.folder.claimed`.  Raises OSError, InputError."""
-    return claimed(folder, OURS)
 
 
 def measure(mesh: Mesh, scene: RayScene, views: Views) -> Callable[[], dict]:
@@ -130,7 +122,7 @@ def write_results(
 ) -> None:
     """Writes :data:`FILES`; on an error the folder is unchanged.  Raises OSError, ValueError.
 
-    replacing: from :func:`claim`.  glb, page: from :func:`encode`.  sheet: contact sheet of the asset, from
+    replacing: from :func:`.folder.claimed`.  glb, page: from :func:`encode`.  sheet: contact sheet of the asset, from
     :func:`~reli3d.output.preview.preview`.  info: content of ``run_info.json``, to which the environment convention is
     added.  comparison: contact sheet of a refinement.
     """
@@ -170,10 +162,6 @@ def camera_record(names: Sequence[str], c2w: Tensor, translation: Sequence[float
     exact = c2w.cpu().double()
     exact[:, :3, 3] += torch.tensor(translation, dtype=torch.float64, device="cpu")
     return [{"name": n, "transform_matrix": m} for n, m in zip(names, exact.tolist(), strict=True)]
-
-
-def weights_record(manifest: Manifest, digest: str) -> dict:
-    return {"file": Path(manifest.path).name, "sha256": digest, "license": manifest.license}
 
 
 def versions() -> dict[str, str]:

@@ -69,9 +69,33 @@ def viewer_page(
 def photograph_stops(views: Views) -> list[dict]:
     """Camera stops at the input views, in the frame of the meshes.
 
-    Images are downsampled to ``MAX_IMAGE_PIXELS``, with the masks as alpha.
+    Images are downsampled to ``MAX_IMAGE_PIXELS``, with the masks as alpha; intrinsics are those of the scaled image.
     """
-    return [_stop(views, i) for i in range(len(views))]
+    stops = []
+    for i in range(len(views)):
+        height, width = views.masks[i].shape
+        rgba = np.concatenate([views.images[i].cpu().numpy(), views.masks[i].cpu().numpy()[..., None]], -1)
+        bitmap = Image.fromarray((rgba * 255 + 0.5).astype(np.uint8))
+        scale = min(1.0, MAX_IMAGE_PIXELS / max(width, height))
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        if size != bitmap.size:
+            bitmap = bitmap.resize(size, Image.Resampling.BOX)
+        data = io.BytesIO()
+        # an unregistered name would make Pillow import all formats
+        bitmap.save(data, WebPImagePlugin.WebPImageFile.format, quality=QUALITY, method=METHOD)
+        fx, fy, cx, cy = views.intrinsics[i].tolist()
+        sx, sy = size[0] / width, size[1] / height
+        stops.append(
+            {
+                "name": printable(views.names[i]),
+                "image": f"data:image/webp;base64,{_base64(data.getvalue())}",
+                "width": size[0],
+                "height": size[1],
+                "c2w": views.c2w[i].tolist(),
+                "intrinsics": [fx * sx, fy * sy, cx * sx, cy * sy],
+            }
+        )
+    return stops
 
 
 def _base64(data: bytes) -> str:
@@ -93,27 +117,3 @@ def _light(name: str, radiance: Tensor) -> dict:
     """An environment map and its spherical harmonics for each channel."""
     harmonics = light_harmonics(Environment(radiance)).T.tolist()
     return {"name": name, "hdr": _base64(environment_bytes(radiance)), "harmonics": harmonics}
-
-
-def _stop(views: Views, i: int) -> dict:
-    """One input image with its camera; the intrinsics are those of the scaled image."""
-    height, width = views.masks[i].shape
-    rgba = np.concatenate([views.images[i].cpu().numpy(), views.masks[i].cpu().numpy()[..., None]], -1)
-    bitmap = Image.fromarray((rgba * 255 + 0.5).astype(np.uint8))
-    scale = min(1.0, MAX_IMAGE_PIXELS / max(width, height))
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    if size != bitmap.size:
-        bitmap = bitmap.resize(size, Image.Resampling.BOX)
-    data = io.BytesIO()
-    # an unregistered name would make Pillow import all formats
-    bitmap.save(data, WebPImagePlugin.WebPImageFile.format, quality=QUALITY, method=METHOD)
-    fx, fy, cx, cy = views.intrinsics[i].tolist()
-    sx, sy = size[0] / width, size[1] / height
-    return {
-        "name": printable(views.names[i]),
-        "image": f"data:image/webp;base64,{_base64(data.getvalue())}",
-        "width": size[0],
-        "height": size[1],
-        "c2w": views.c2w[i].tolist(),
-        "intrinsics": [fx * sx, fy * sy, cx * sx, cy * sy],
-    }

@@ -12,11 +12,10 @@ from scipy.linalg import rq
 from reli3d.errors import InputError, shown
 from reli3d.io.files import read_bytes
 from reli3d.views.file_names import images_in, named
-from reli3d.views.frames import Frame, Lens, nearest_rigid
+from reli3d.views.frames import MAX_SKEW, Frame, Lens, nearest_rigid
 
 NEUS = ("cameras_sphere.npz", "cameras.npz")
 MAX_BYTES = 1 << 26  # 4,096 cameras in two matrices each take 1 MB
-MAX_SKEW = 1e-3  # of the focal length: half a pixel across an image
 LLFF_IMAGES = ("images", "images_2", "images_4", "images_8")  # the last ones scaled down
 
 

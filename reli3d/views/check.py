@@ -224,11 +224,11 @@ def draw_rig(views: Views, path: str | os.PathLike) -> None:
         at = (MARGIN + i % columns * (THUMB + MARGIN), PANEL + 2 * MARGIN + i // columns * (THUMB + 18 + MARGIN))
         canvas.paste(_thumbnail(views, hull, i), at)
         label = f"{i} {os.path.basename(views.names[i])[:18]}  {100 * filled[i]:.0f} %"
-        ImageDraw.Draw(canvas).text((at[0], at[1] + THUMB + 2), _latin(label), fill=_COLORS[i % len(_COLORS)])
+        ImageDraw.Draw(canvas).text((at[0], at[1] + THUMB + 2), latin(label), fill=_COLORS[i % len(_COLORS)])
     write_png(path, np.asarray(canvas))
 
 
-def _latin(text: str) -> str:
+def latin(text: str) -> str:
     return text.encode("latin-1", "replace").decode("latin-1")  # Pillow's built-in font has no more
 
 

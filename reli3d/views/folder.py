@@ -19,7 +19,7 @@ from torch import Tensor
 
 from reli3d._bridge import full_precision, present
 from reli3d.errors import InputError, printable, shown
-from reli3d.io.images import above, color_of, decode_image, unit
+from reli3d.io.images import ASPECT, above, color_of, decode_image, unit
 from reli3d.views.array_cameras import NEUS, read_llff, read_neus
 from reli3d.views.background import Remover
 from reli3d.views.choose import DUPLICATE_DISTANCE_RAD, choose_views, spread_notes
@@ -37,7 +37,6 @@ MAX_VIEWS = 16
 MIN_SIDE = 8  # pixels; below it there is nothing to see, and a mistake is likely
 MIN_OBJECT = 16  # pixels of the mask
 SPLITS = tuple(f"transforms_{name}.json" for name in ("train", "val", "test"))  # of NeRF-synthetic
-ASPECT = 0.01  # relative difference of the image's aspect and the camera's up to which the intrinsics are rescaled
 
 
 @full_precision

@@ -13,6 +13,7 @@ MAX_PATH = 1024
 ORTHONORMAL = 1e-3  # largest entry of R^T R - 1: four digits in a text file; beyond it is a shear or a scale
 MAX_POSE_DISTANCE = 1e6  # float32 poses keep a tenth of a unit there
 MAX_DISTORTION_PIXELS = 1.0  # displacement of a pixel up to which a lens is used as a pinhole
+MAX_SKEW = 1e-3  # of the focal length: half a pixel across an image
 RADII = 32  # of an image's diagonal at which distortion is evaluated
 
 

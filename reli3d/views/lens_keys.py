@@ -21,12 +21,11 @@ from dataclasses import replace
 import numpy as np
 
 from reli3d.errors import InputError, shown
-from reli3d.views.frames import Lens, number
+from reli3d.views.frames import MAX_SKEW, Lens, number
 
 DEFAULT_FOV = 0.7  # radians, of the ReLi3D release
 MIN_FOV = 1e-6  # radians: the tangent of a much smaller angle is 0
 AGREE = 0.02  # relative difference up to which two spellings of one focal length agree
-MAX_SKEW = 1e-3  # of the focal length: half a pixel across an image
 _PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE", "PERSP")
 _MATRICES = (
     "intrinsics",

@@ -172,12 +172,9 @@ class MaskFiles:
                 self._images.setdefault(os.path.realpath(found), []).append(image)
         for frame in frames:
             if frame.mask is not None:
-                self._claim(frame.mask, frame.image)
-
-    def _claim(self, mask: Path, image: Path) -> None:
-        others = self._images.setdefault(os.path.realpath(mask), [])
-        if os.path.realpath(image) not in map(os.path.realpath, others):
-            others.append(image)
+                others = self._images.setdefault(os.path.realpath(frame.mask), [])
+                if os.path.realpath(frame.image) not in map(os.path.realpath, others):
+                    others.append(frame.image)
 
     def _other_images(self, images: dict[str, Path]) -> Iterator[Path]:
         """Images in nested folders that are no frames: a mask named after one of these may be another's."""

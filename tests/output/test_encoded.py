@@ -11,6 +11,7 @@ import torch
 from reli3d.geometry.camera import look_at
 from reli3d.io.glb import glb_bytes
 from reli3d.output import results
+from reli3d.output.folder import claimed
 from reli3d.render.asset import Asset
 from reli3d.render.lights import studio
 from reli3d.views.views import Views
@@ -33,7 +34,7 @@ def views():
 
 
 def written(folder, asset, views, **options):
-    with results.claim(folder) as replacing:
+    with claimed(folder, results.OURS) as replacing:
         files = results.encode(asset, views, RECORD, name="ball", **options)
         results.write_results(replacing, asset, *files, PREVIEW, {**RECORD, "object": "ball"})
 
