@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from reli3d.fit.refine import Refinement
 
 REFINED = 384  # pixels per side of the views that a refinement compares with
+LEAST_REFINED = 3  # views with the complete object from which a refinement leaves out the others
 INSIDE = 2.0  # pixels from the silhouette within which colors may be mixed with the background
 MIN_PART_FRACTION = 0.01  # of the faces; smaller components are removed
 TEXELS = 1 << 19  # evaluated at once on a CPU: 100 bytes each
@@ -422,10 +423,10 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     >>> asset = reli3d.refine(reli3d.reconstruct(views.taken()), views, seconds=60)
     """
     options = {"light": views.lighting, **options}
-    whole = whole_views(views.masks)
+    whole = whole_views(views.masks, LEAST_REFINED)
     if not isinstance(options["light"], str) and len(options["light"]) == len(views):
         options["light"] = [options["light"][i] for i in whole]
-    batch = views.select(whole).to(asset.mesh.vertices.device).resampled(REFINED)
+    batch = views.select(whole).to(asset.mesh.vertices.device).resampled(REFINED, linear=True)
     return _refined(asset, batch, seconds=seconds, steps=steps, **options).asset
 
 
@@ -513,8 +514,8 @@ def reconstruct_folder(
         views, batch = photographs.taken(), None
         fit: dict[str, Any] = {}
         if reading.budget:
-            photographs = photographs.select(whole_views(photographs.masks))
-            batch, names = photographs.resampled(REFINED), photographs.names
+            photographs = photographs.select(whole_views(photographs.masks, LEAST_REFINED))
+            batch, names = photographs.resampled(REFINED, linear=True), photographs.names
             fit = {"light": reading.lighting(photographs), "cameras": reading.cameras, **reading.budget}
         del photographs  # 1 GB of 60 images of 1 MP
     if options.up == "y" and (axis := up_axis(views.c2w)) not in (None, "y"):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from reli3d._bridge import full_precision
+from reli3d._bridge import full_precision, present
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.symmetry import MirrorPlane, mirror_plane
@@ -50,7 +50,7 @@ def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepa
     else:
         batch = moved.resampled(model.preset.image_size)
     detail = moved.resampled(DETAIL, crop=not published)
-    silhouette = mask_distance(detail.masks)
+    silhouette = mask_distance(present("silhouettes", detail.silhouettes))
     return Prepared(batch, torch.cat([detail.images, silhouette[..., None]], -1).contiguous(), detail.camera)
 
 

@@ -435,12 +435,16 @@ def _least_compatible(views: Sequence[View], masks: dict[str, np.ndarray]) -> in
 
 
 def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float | None) -> tuple[Frame, np.ndarray]:
-    """``up`` to +Y, the ground at 0, the middle of the ``hull (N, 3)`` above the origin, its longest side 1 or
-    ``size`` millimeters; and the box ``(2, 3)`` of the hull in it.
+    """``up`` to +Y, the longer side of the smallest rectangle around ``hull (N, 3)`` to X, the ground at 0, the middle
+    above the origin, the longest side 1 or ``size`` millimeters; and the box ``(2, 3)`` of the hull in it.
     """
     y = up / np.linalg.norm(up)
     x = np.cross(y, np.eye(3)[np.abs(y).argmin()])
     x /= np.linalg.norm(x)
+    turn = np.stack([x, y, np.cross(x, y)])
+    corners = cv2.boxPoints(cv2.minAreaRect((hull @ turn[::2].T).astype(np.float32)))
+    side = max(corners[1] - corners[0], corners[2] - corners[1], key=np.linalg.norm).astype(np.float64)
+    x = side / np.linalg.norm(side) @ turn[::2]
     turn = np.stack([x, y, np.cross(x, y)])
     turned = hull @ turn.T
     bottom = turned[:, 1].min() if ground is None else max(ground, turned[:, 1].min())

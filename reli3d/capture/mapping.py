@@ -159,7 +159,9 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
     images, database, scales, by_path = work / "images", work / "database.db", {}, {}
     for k, photo in enumerate(photos):
         path = f"{lenses.index(photo.lens)}/{k:05d}.png"
-        scales[path], by_path[path] = min(1.0, side / max(photo.size)), photo
+        by_path[path] = photo
+        size = [round(n * min(1.0, side / max(photo.size))) for n in photo.size]
+        scales[path] = np.array(size) / photo.size
         _write(images / path, photo.pixels, scales[path])
         if masks is not None:
             _write(work / "masks" / f"{path}.png", 255 * grown(masks[k] > 0, MASK_MARGIN), scales[path])
@@ -176,11 +178,11 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
         view = next((v for v in known.views if v.photo.lens == photo.lens), None) if known else None
         if view:
             scale = scales[names[0]]
-            values = view.focal * scale, *(view.principal * scale), view.radial
+            values = view.focal * scale.mean(), *(view.principal * scale), view.radial
             reader.camera_params = ",".join(str(float(x)) for x in values)
         elif photo.focal:
-            width, height = (round(s * scales[names[0]]) for s in photo.size)
-            reader.camera_params = f"{photo.focal * scales[names[0]]},{width / 2},{height / 2},0"
+            (width, height), scale = photo.size * scales[names[0]], scales[names[0]].mean()
+            reader.camera_params = f"{photo.focal * scale},{width / 2},{height / 2},0"
         # Numbers the images in order: the extraction would number them in the order in which its threads finish.
         pycolmap.import_images(database, images, pycolmap.CameraMode.PER_FOLDER, names, reader)
         for first in range(0, len(names), 4):  # a few at a time: the bar moves
@@ -228,10 +230,11 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
         return _read_model(largest, data, by_path, scales)
 
 
-def _write(path: Path, pixels: np.ndarray, scale: float) -> None:
+def _write(path: Path, pixels: np.ndarray, scale: np.ndarray) -> None:
+    """scale: of width and height, at most 1."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    if scale < 1.0:
-        size = round(pixels.shape[1] * scale), round(pixels.shape[0] * scale)
+    size = round(pixels.shape[1] * scale[0]), round(pixels.shape[0] * scale[1])
+    if size != pixels.shape[1::-1]:
         pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
     ok = cv2.imwrite(str(path), pixels[..., ::-1] if pixels.ndim == 3 else pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not ok:
@@ -244,7 +247,7 @@ def grown(mask: np.ndarray, margin: float) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
 
 
-def _read_model(model, database, by_path: dict[str, Photo], scales: dict[str, float]) -> Map:
+def _read_model(model, database, by_path: dict[str, Photo], scales: dict[str, np.ndarray]) -> Map:
     index = {identifier: k for k, identifier in enumerate(model.points3D)}
     points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3)
     error = np.array([p.error for p in model.points3D.values()])
@@ -260,7 +263,7 @@ def _read_model(model, database, by_path: dict[str, Photo], scales: dict[str, fl
                 by_path[image.name],
                 pose.rotation.matrix(),
                 np.asarray(pose.translation),
-                focal / scale,
+                focal / float(scale.mean()),
                 np.array([cx, cy]) / scale,
                 float(radial),
                 np.array([p.xy for p in observed]).reshape(-1, 2) / scale,
@@ -270,7 +273,7 @@ def _read_model(model, database, by_path: dict[str, Photo], scales: dict[str, fl
     return Map(tuple(views), points, error, tracks, _matches(database, [image.name for image in registered], scales))
 
 
-def _matches(database, paths: Sequence[str], scales: dict[str, float]) -> tuple:
+def _matches(database, paths: Sequence[str], scales: dict[str, np.ndarray]) -> tuple:
     numbers = [database.read_image_with_name(path).image_id for path in paths]
     pixels = [database.read_keypoints(n)[:, :2] / scales[path] for n, path in zip(numbers, paths, strict=True)]
     found = []

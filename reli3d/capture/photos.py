@@ -14,6 +14,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from reli3d.errors import InputError, shown
 from reli3d.io.files import file_size
+from reli3d.io.images import in_srgb
 from reli3d.views.missing_cameras import PHOTOGRAPHS, VIDEOS
 
 LONGEST_SIDE = 2000  # pixels of a photograph that is kept
@@ -21,6 +22,7 @@ FRAME_COUNT = 60  # frames taken from a video
 MOST_PHOTOS = 120  # of a folder: of more every second, third, ... is read
 FEWEST = 8  # photographs, below which no closed shape can be expected
 MAX_PIXELS = 1 << 27
+UNSPECIFIED, HD = 2, 720  # FFmpeg's number of an unknown color space; rows of high definition
 HDR_TRANSFERS = (16, 18)  # PQ and HLG, as FFmpeg numbers transfer functions
 WHOLE_VIDEO = 0.9  # fraction of the frames that a file announces, below which it is cut off
 SHARPNESS_SIDE = 640  # pixels at which sharpness is compared
@@ -87,12 +89,14 @@ def _read_folder(folder: Path, progress: Progress) -> tuple[list[Photo], list[st
         notes.append(f"one of {step} photographs is read: {len(files[::step])} of {len(files)}")
         files = files[::step]
     stems = [p.stem for p in files]
-    photos = []
+    photos, converted = [], list[str]()
     for k, path in enumerate(files):
         progress("reading", k, len(files))
         name = path.stem if stems.count(path.stem) == 1 else path.name
-        photos.append(_read_photo(path, name))
+        photos.append(_read_photo(path, name, converted))
     progress("reading", len(files), len(files))
+    if converted:
+        notes.append(f"{converted[0]}; {len(converted)} of {len(files)} such images")
     return photos, notes
 
 
@@ -104,7 +108,7 @@ def optional_module(module: str) -> ModuleType:
         raise InputError(module, "is not installed: pip install 'reli3d[capture]'") from None
 
 
-def _read_photo(path: Path, name: str) -> Photo:
+def _read_photo(path: Path, name: str, notes: list[str]) -> Photo:
     file_size(path)
     try:
         with Image.open(path) as image:
@@ -117,7 +121,7 @@ def _read_photo(path: Path, name: str) -> Photo:
             upright = ImageOps.exif_transpose(image)
             if upright.mode.startswith("I;16"):
                 upright = Image.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
-            upright = upright.convert("RGB")
+            upright = in_srgb(upright, path.name, notes).convert("RGB")
             upright.thumbnail((LONGEST_SIDE, LONGEST_SIDE), Image.Resampling.BOX, reducing_gap=None)
     except InputError:
         raise
@@ -209,6 +213,8 @@ def _frame_pixels(frame, aspect: float) -> np.ndarray:
     """RGB of a decoded frame, upright, with square pixels, reduced to LONGEST_SIDE.  aspect: of a stored pixel."""
     width, height = frame.width * aspect, frame.height
     scale = min(1.0, LONGEST_SIDE / max(width, height))
-    pixels = frame.to_ndarray(format="rgb24", width=round(width * scale), height=round(height * scale))
+    untagged = frame.colorspace == UNSPECIFIED and frame.height >= HD  # players assume BT.709, FFmpeg BT.601
+    space = {"src_colorspace": "ITU709", "dst_colorspace": "ITU709"} if untagged else {}
+    pixels = frame.reformat(round(width * scale), round(height * scale), "rgb24", **space).to_ndarray()
     turns = round(float(getattr(frame, "rotation", 0) or 0) / 90.0) % 4  # degrees counter-clockwise
     return np.ascontiguousarray(np.rot90(pixels, turns))

@@ -88,9 +88,11 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
     if args.decimate is not None and len(asset.mesh.faces) > args.decimate:
         with extra("--decimate"):
             mesh = decimate(asset.mesh, args.decimate)
-        asset = transfer_textures(replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)), asset, baked)
+        asset = transfer_textures(
+            replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)), asset, baked, shape=True
+        )
     elif size != asset.textures.size or (args.format != "glb" and not portable(asset)):
-        asset = transfer_textures(asset.mesh, asset, baked)
+        asset = transfer_textures(asset.mesh, asset, baked, shape=True)
     name = args.glb.stem
     if args.format == "glb":
         files = {f"{name}.glb": glb_bytes(asset, textures=args.textures, translation=origin)}

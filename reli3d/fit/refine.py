@@ -142,7 +142,8 @@ def refine(
             "set light to camera"
         )
     with torch.random.fork_rng(devices=[]):
-        data = FixedSurface(Start.of(first), first, received, near, used)
+        start = Start.of(first, c2w=near.camera.c2w[used] if images.light_moves else None)
+        data = FixedSurface(start, first, received, near, used)
         fitted = _fitted(data, options, budget, notes)
         kept, parts, after = chosen(fitted, used, list(held), before)
     if budget.bar is not None:

@@ -231,7 +231,9 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     color, cover = view_colors(planes, position, camera)
     weight = view_weights(scene, position, normal, camera) * (cover.detach() > MIN_COVERAGE)
     exposure = unknowns.exposure[data.colored].exp()
-    loss = weights.agreement * losses.agreement(color, weight) if len(data.colored) > 1 else color.new_zeros(())
+    loss = color.new_zeros(())
+    if len(data.colored) > 1 and not images.light_moves and len(set(images.light_group)) == 1:
+        loss = weights.agreement * losses.agreement(color, weight)  # a point has one color under one lighting
     if weights.shading == 0.0:
         return loss
     row = torch.nonzero(weight.sum(1) > 0.0)[:SHADED_POINTS, 0]

@@ -44,14 +44,22 @@ def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, 
     return face, bary
 
 
-def transfer_textures(mesh: Mesh, source: Asset, size: int) -> Asset:
-    """``mesh`` with a new atlas of ``size`` texels per side, and the lighting and maps of ``source``."""
+def transfer_textures(mesh: Mesh, source: Asset, size: int, *, shape: bool = False) -> Asset:
+    """``mesh`` with a new atlas of ``size`` texels per side, and the lighting and maps of ``source``.
+
+    shape: whether shading normals show the shape of ``source``, of which ``mesh`` is an approximation; otherwise its
+    normal map alone is transferred.
+    """
+    if (factor := source.textures.size // size) > 1:
+        source = replace(source, textures=_reduced(source.textures, factor))
     mesh = unwrap(mesh, texture_size=size)
     mesh = replace(mesh.with_tangents(), colors=None)  # vertex colors are baked into the maps below
 
     def at_texels(position: Tensor, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:
         face, bary = nearest_hits(source.mesh, position, normal)
         old = surface_points(source.mesh, source.textures, face, bary)
+        if shape:
+            return _maps(old, normal, tangent)
         bump = old.normal - unit(
             interpolate(present("mesh.normals", source.mesh.normals), source.mesh.faces, face, bary)
         )
@@ -59,6 +67,17 @@ def transfer_textures(mesh: Mesh, source: Asset, size: int) -> Asset:
 
     baked = bake(mesh, size, at_texels, tangents=True, chunk=size * size)
     return Asset(mesh, _textures(baked), source.environment)
+
+
+def _reduced(maps: TextureSet, factor: int) -> TextureSet:
+    """Means over squares of ``factor`` texels."""
+
+    def mean(values: Tensor) -> Tensor:
+        planes = values.reshape(*values.shape[:2], -1).permute(2, 0, 1)[None]
+        return torch.nn.functional.avg_pool2d(planes, factor)[0].permute(1, 2, 0)
+
+    names = "base_color", "roughness", "metallic", "normal"
+    return TextureSet(**{name: mean(getattr(maps, name)) for name in names}, wrap=maps.wrap)
 
 
 def changed(asset: Asset, unknowns: Unknowns) -> Asset:

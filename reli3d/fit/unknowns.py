@@ -17,7 +17,9 @@ from reli3d.fit.fields import space_field
 from reli3d.geometry.bake import rasterize_texels
 from reli3d.geometry.camera import Camera
 from reli3d.render.asset import Asset
+from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
+from reli3d.render.latlong import lat_long_directions
 from reli3d.render.points import SurfacePoints
 
 LOGIT_MARGIN = 0.005  # from 0 and 1 at which values are clamped before the logit
@@ -82,8 +84,11 @@ class Start:
     light: Tensor
 
     @classmethod
-    def of(cls, asset: Asset, texels: int = 256) -> Start:
-        """Initial values of an asset in the box [-1, 1]^3; the material is extrapolated from its surface."""
+    def of(cls, asset: Asset, texels: int = 256, c2w: Tensor | None = None) -> Start:
+        """Initial values of an asset in the box [-1, 1]^3; the material is extrapolated from its surface.
+
+        c2w: ``(V, 4, 4)``, cameras in whose axes the lighting is represented, as the mean over them.
+        """
         found = rasterize_texels(asset.mesh, texels)
         valid = found.face.reshape(-1) >= 0
         points = surface_points(
@@ -91,6 +96,9 @@ class Start:
         )
         material = filled_grid(points.position, material_logits(points), START_GRID)
         radiance = asset.light.resized(LIGHT_ROWS).radiance
+        if c2w is not None:
+            world = lat_long_directions(LIGHT_ROWS, device=radiance.device)[None, :, :] @ c2w[:, None, :3, :3].mT
+            radiance = Environment(radiance).lookup(world.contiguous()).mean(0)
         return cls(material, radiance.clamp(min=MIN_RELATIVE_RADIANCE * float(radiance.mean())).log())
 
 

@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from reli3d._bridge import present
 from reli3d.errors import InputError, shown
 from reli3d.io.gltf import Document
 from reli3d.render.asset import TextureSet
@@ -64,6 +65,13 @@ class _Material:
     specular: list[float] | None = None  # of the specular-glossiness workflow, with ``glossiness``
     glossiness: float = 1.0
 
+    def decoded(self, slot: int) -> Tensor:
+        """Image ``(H, W, 4)`` of a slot, colors decoded from sRGB, which glTF asks for before interpolation."""
+        image = present("image", self.slots[slot]).image
+        if slot == 0 or slot == 1 and self.specular is not None:
+            return torch.cat([srgb_to_linear(image[..., :3]), image[..., 3:]], -1)
+        return image
+
 
 class Materials:
     """Texture sets of the materials of one document."""
@@ -107,7 +115,7 @@ class Materials:
             slots = material.slots
             size = max((max(s.image.shape[:2]) for s in slots if s is not None), default=UNIFORM_SIZE)
             self._count(size, f"materials[{index}]")
-            maps = [None if s is None else _square(s.image, size) for s in slots]
+            maps = [None if s is None else _square(material.decoded(k), size) for k, s in enumerate(slots)]
             wrap = next((s.layout.wrap for s in slots if s is not None), ("repeat", "repeat"))
             self.made[index] = self._make(material, maps, size, wrap)
         return self.made[index]
@@ -130,17 +138,18 @@ class Materials:
         center = (np.arange(size) + 0.5) / size
         uv = np.stack(np.meshgrid(center, center), -1).reshape(-1, 2) * span + low
         maps: list[Tensor | None] = []
-        for slot in material.slots:
+        for k, slot in enumerate(material.slots):
             if slot is None:
                 maps.append(None)
                 continue
-            height, width = slot.image.shape[:2]
+            image = material.decoded(k)
+            height, width = image.shape[:2]
             at = np.array(slot.layout.apply(uv))
             for axis, mode in enumerate(slot.layout.wrap):  # within float32's precision
                 at[:, axis] = np.clip(at[:, axis], -1.0, 2.0) if mode == "clamp" else at[:, axis] % 2.0
             place = wrap_uv(torch.from_numpy(at).float(), slot.layout.wrap, (width, height))
-            color = sample_texture(slot.image[..., :3].contiguous(), place)
-            alpha = sample_texture(slot.image[..., 3:].expand(-1, -1, 3).contiguous(), place)
+            color = sample_texture(image[..., :3].contiguous(), place)
+            alpha = sample_texture(image[..., 3:].expand(-1, -1, 3).contiguous(), place)
             maps.append(torch.cat([color, alpha[:, :1]], 1).reshape(size, size, 4))
         return self._make(material, maps, size, ("clamp", "clamp"))
 
@@ -154,12 +163,12 @@ class Materials:
     def _make(self, material: _Material, maps: list[Tensor | None], size: int, wrap: tuple[str, str]) -> TextureSet:
         white = torch.ones(size, size, 4, dtype=torch.float32, device="cpu")
         color, parameters = (white if m is None else m for m in maps[:2])
-        color = srgb_to_linear(color[..., :3]) * _factor(material.color).clamp(0.0, 1.0)
+        color = color[..., :3] * _factor(material.color).clamp(0.0, 1.0)
         if material.specular is None:
             rough = parameters[..., 1] * min(max(material.roughness, 0.0), 1.0)
             metal = parameters[..., 2] * min(max(material.metallic, 0.0), 1.0)
         else:
-            specular = srgb_to_linear(parameters[..., :3]) * _factor(material.specular).clamp(0.0, 1.0)
+            specular = parameters[..., :3] * _factor(material.specular).clamp(0.0, 1.0)
             rough = 1.0 - parameters[..., 3] * min(max(material.glossiness, 0.0), 1.0)
             color, metal = metallic_from_specular(color, specular)
         normal = None if maps[2] is None else maps[2][..., :3]

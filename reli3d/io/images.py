@@ -15,7 +15,7 @@ from threading import BoundedSemaphore, Lock
 
 import numpy as np
 import torch
-from PIL import Image, ImageOps
+from PIL import Image, ImageCms, ImageOps
 from torch import Tensor
 
 from reli3d.errors import InputError, shown
@@ -153,10 +153,30 @@ def _decoded(path, image: Image.Image, notes: list[str], calibrated: tuple[int, 
         if image.mode == "I" and (gray.min() < 0 or gray.max() > 65535):
             raise InputError(path, "expected 8 or 16 bit gray, got 32 bit; save as 8 bit PNG")
         return Image.fromarray(gray)
+    image = in_srgb(image, os.path.basename(path), notes)
     transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
     mode = "RGBA" if transparent else "L" if image.mode in ("1", "L") else "RGB"
     image.load()
     return image if image.mode == mode else image.convert(mode)
+
+
+def in_srgb(image: Image.Image, name: str, notes: list[str]) -> Image.Image:
+    """``image``, RGB or RGBA, converted from the color space of its ICC profile, such as Display P3, with a note."""
+    profile = image.info.get("icc_profile")
+    if not profile or image.mode not in ("RGB", "RGBA"):
+        return image
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        title = ImageCms.getProfileDescription(source).strip()
+        if "srgb" in title.lower():
+            return image
+        target = ImageCms.createProfile("sRGB")
+        converted = ImageCms.profileToProfile(image, source, target, outputMode=image.mode)
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError) as error:
+        notes.append(f"{name}: its color profile is not used ({shown(str(error))}), sRGB is assumed")
+        return image
+    notes.append(f"{name}: colors converted from {shown(title)} to sRGB")
+    return converted or image
 
 
 def _aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:

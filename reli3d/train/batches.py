@@ -172,8 +172,8 @@ def load_sample(
         color = (color + float(rng.random()) * MAX_NOISE * noise).clamp(0, 1)
     mirrors = Camera(c2w[:0], intrinsics[:0], *masks.shape[:0:-1])
     if plane is not None:
-        normal = turn @ torch.as_tensor(plane[0], dtype=torch.float32, device=device)
-        mirrors = MirrorPlane(normal, plane[1]).mirrored(Camera(c2w, intrinsics, *masks.shape[:0:-1]))
+        axis = turn @ torch.as_tensor(plane[0], dtype=torch.float32, device=device)
+        mirrors = MirrorPlane(axis, plane[1]).mirrored(Camera(c2w, intrinsics, *masks.shape[:0:-1]))
     origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # depth of the world's origin
     return Sample(
         images=color.contiguous(),

@@ -70,7 +70,8 @@ def read_neus(folder: Path, path: Path) -> tuple[list[Frame], list[str]]:
         if [m.shape for m in pair] != [(4, 4), (4, 4)]:
             raise InputError(where, "expected a 4x4 array each, got none or another shape; export the cameras again")
         world, scale = (_finite(path, m) for m in pair)
-        focal, center, c2w = decompose_projection(where, (world @ scale)[:3])
+        focal, (cx, cy), c2w = decompose_projection(where, (world @ scale)[:3])
+        center = cx + 0.5, cy + 0.5  # pixel centers at whole numbers there
         name = image.relative_to(folder).as_posix()
         c2w = nearest_rigid(where, "rotation", c2w)
         frames.append(Frame(where, name, image, masks[0][k] if masks else None, c2w, Lens(focal=focal, center=center)))

@@ -183,7 +183,7 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
         _check_inner(where, frame)
         _check_inner(where, data)
         notes.append(f"{where}: no field of view given, {DEFAULT_FOV} radians assumed as in the ReLi3D release")
-        lens = Lens(fov=(DEFAULT_FOV, DEFAULT_FOV), center=center)
+        lens = Lens(fov=(DEFAULT_FOV, math.nan), center=center)
     radial, tangential = (tuple(found(k) or 0.0 for k in keys) for keys in (_RADIAL, _TANGENTIAL))
     model = frame.get("camera_model", data.get("camera_model"))
     if radial[3] and isinstance(model, str) and model.upper() == "FULL_OPENCV":  # of a denominator there
@@ -283,8 +283,7 @@ def _fov(where: str, key: str, value: object) -> tuple[float, float]:
         value = value[0]
     if isinstance(value, list):
         return _pair(where, key, value, MIN_FOV, math.pi)
-    angle = number(where, key, value, MIN_FOV, math.pi)
-    return angle, angle
+    return number(where, key, value, MIN_FOV, math.pi), math.nan  # square pixels
 
 
 def _pair(where: str, key: str, value: object, low: float, high: float) -> tuple[float, float]:

@@ -13,9 +13,8 @@ from reli3d.views.similarity import Similarity
 from reli3d.views.views import Views, mask_box, whole_views
 
 RADIUS = 0.87  # half side of the network's cube
-HULL_SLACK = 1.1  # a hull of few views exceeds its object by about a tenth, so it may exceed the cube by as much
-LONGEST = 0.55  # longest side from which an object in the cube needs no rescaling; in training it is 1
-OFF_CENTER = 0.3  # as far as the hull's center of such an object may lie from the origin
+LONGEST = 0.8, 1.15  # longest side of a hull whose poses are kept; in training the object's is 1
+REACH = 0.62  # its greatest coordinate: a tenth more than the side of the network's feature volume
 GRIDS = (24, 44)  # cells a side, coarse and refined: the last is 2 to 3 % of the object
 BALL = 1.3  # diameter of the ball that limits the hull, in mask widths: a generic view shows 0.8 of the longest side
 ONE_SIDED = math.radians(90.0)  # between eyes: beyond it the views bound each other's depth
@@ -48,8 +47,8 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
     """The transform from the frame of the input cameras to the network's frame (no rotation).
 
     mode ``none``: identity.  ``hull``: the visual hull's box is centered, its longest side scaled to 1, as in
-    training.  ``auto``: the same with ``views.object_box`` if there is one; else the identity if the hull lies in the
-    network's cube of half side 0.87, is at least 0.55 long and centered within 0.3; else ``hull``.
+    training.  ``auto``: the same with ``views.object_box`` if there is one; else the identity if the longest side of
+    the hull is 0.8 to 1.15 and its coordinates are at most 0.62, about as in training; else ``hull``.
 
     With all cameras within 90 degrees, the hull is cut at 1.3 times the width of the masks and the box aligned with the
     mean viewing direction.  From one direction, the depth is the width, nearest to the origin.  Raises InputError if no
@@ -65,12 +64,12 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
         return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64, device="cpu"), -(low + high) / (2 * longest))
     hull = visual_hull(views)
     low, high = hull.box()
-    inside = float(torch.maximum(-low, high).max()) <= HULL_SLACK * RADIUS
+    inside = float(torch.maximum(-low, high).max()) <= REACH and float(hull.points.norm(dim=-1).max()) <= RADIUS
     basis = _one_sided_basis(views, hull)
     points = hull.points @ basis
     low, high = points.amin(0), points.amax(0)
     longest, center = float((high - low).max()), basis @ ((low + high) / 2)
-    if mode == "auto" and inside and longest >= LONGEST and float(center.norm()) <= OFF_CENTER:
+    if mode == "auto" and inside and LONGEST[0] <= longest <= LONGEST[1]:
         return Similarity.identity()
     return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64, device="cpu"), -center / longest)
 

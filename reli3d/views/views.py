@@ -13,6 +13,7 @@ from torch.nn.functional import interpolate, pad
 
 from reli3d._bridge import Movable, check
 from reli3d.geometry.camera import Camera
+from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.views.similarity import Similarity
 
 LEAST_WHOLE = 8  # views with the complete object; if there are as many, cropped views are left out
@@ -27,6 +28,7 @@ class ViewBatch(Movable):
     masks: Tensor
     c2w: Tensor  # (V, 4, 4)
     intrinsics: Tensor  # (V, 4) of the resampled images
+    silhouettes: Tensor | None = None  # (V, S, S) masks, continued beyond the image border
 
     def __len__(self) -> int:
         return self.images.shape[0]
@@ -116,30 +118,36 @@ class Views(Movable):
         """
         return replace(self, c2w=similarity.of_cameras(self.c2w), object_box=None)
 
-    def resampled(self, size: int, *, crop: bool = True, padding: float = 0.08) -> ViewBatch:
+    def resampled(self, size: int, *, crop: bool = True, padding: float = 0.08, linear: bool = False) -> ViewBatch:
         """All views at ``size`` x ``size`` pixels, with the intrinsics of the new pixels.
 
         crop: crop to a square around the mask, with a margin of ``padding`` times its side on each side; beyond the
         image border, the mask is 0 and the color is the nearest edge pixel's.  If False, the whole image is stretched
-        to the square.  Downsampling uses a triangle filter over the area of the new pixels, upsampling is bilinear.
-        Raises ValueError for a size below 1 or, with ``crop``, for an empty mask.
+        to the square.  linear: average linear instead of sRGB values.  Downsampling uses a triangle filter over the
+        area of the new pixels, upsampling is bilinear.  Raises ValueError for a size below 1 or, with ``crop``, for an
+        empty mask.
         """
         if size < 1:
             raise ValueError(f"size: expected at least 1, got {size}")
-        images, masks = self.c2w.new_empty(len(self), size, size, 3), self.c2w.new_empty(len(self), size, size)
+        images = self.c2w.new_empty(len(self), size, size, 3)
+        masks, silhouettes = (self.c2w.new_empty(len(self), size, size) for _ in range(2))
         intrinsics = []
         for k, camera in enumerate(self.intrinsics.double()):
             image, mask = self.images[k], self.masks[k]
             x, y, width, height = _window(mask, padding) if crop else (0, 0, mask.shape[1], mask.shape[0])
             pixels = _cut(image, mask, x, y, width, height)[None]
+            if linear:
+                pixels[:, :3] = srgb_to_linear(pixels[:, :3])
             pixels = interpolate(pixels, (size, size), mode="bilinear", align_corners=False, antialias=True)[0]
+            if linear:
+                pixels[:3] = linear_to_srgb(pixels[:3].clamp(0.0, 1.0))
             images[k] = pixels[:3].permute(1, 2, 0).clamp(0.0, 1.0)
-            masks[k] = pixels[3].clamp(0.0, 1.0)
+            masks[k], silhouettes[k] = pixels[3:].clamp(0.0, 1.0)
             scale = camera.new_tensor([size / width, size / height])
             origin = camera.new_tensor([x, y])
             intrinsics.append(torch.cat([camera[:2] * scale, (camera[2:] - origin) * scale]))
         cameras = torch.stack(intrinsics).to(self.intrinsics.dtype)
-        return ViewBatch(images, masks, self.c2w, cameras)
+        return ViewBatch(images, masks, self.c2w, cameras, silhouettes)
 
 
 def mask_box(mask: Tensor) -> tuple[int, int, int, int]:
@@ -156,10 +164,10 @@ def touches_border(mask: Tensor) -> bool:
     return any(bool((line > 0.5).any()) for line in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
 
 
-def whole_views(masks: Sequence[Tensor]) -> list[int]:
-    """Indices of the ``masks`` that do not touch the border if there are LEAST_WHOLE of them, else of all."""
+def whole_views(masks: Sequence[Tensor], least: int = LEAST_WHOLE) -> list[int]:
+    """Indices of the ``masks`` that do not touch the border if there are ``least`` of them, else of all."""
     whole = [i for i, mask in enumerate(masks) if not touches_border(mask)]
-    return whole if len(whole) >= LEAST_WHOLE else list(range(len(masks)))
+    return whole if len(whole) >= least else list(range(len(masks)))
 
 
 def _window(mask: Tensor, padding: float) -> tuple[int, int, int, int]:
@@ -169,14 +177,14 @@ def _window(mask: Tensor, padding: float) -> tuple[int, int, int, int]:
 
 
 def _cut(image: Tensor, mask: Tensor, x: int, y: int, width: int, height: int) -> Tensor:
-    """``(4, height, width)`` color and mask of a window that may reach over the border."""
+    """``(5, height, width)``: color, mask, and the mask continued beyond the border, of a window that may exceed it."""
     rows, columns = mask.shape
     left, top = max(0, -x), max(0, -y)
     right, bottom = max(0, x + width - columns), max(0, y + height - rows)
     inner = slice(y + top, y + height - bottom), slice(x + left, x + width - right)
-    pixels = torch.empty((4, height - top - bottom, width - left - right), device=image.device, dtype=torch.float32)
+    pixels = torch.empty((5, height - top - bottom, width - left - right), device=image.device, dtype=torch.float32)
     pixels[:3] = image[inner].permute(2, 0, 1)
-    pixels[3] = mask[inner]
+    pixels[3:] = mask[inner]
     if not (left or top or right or bottom):
         return pixels
     pixels = pad(pixels[None], (left, right, top, bottom), mode="replicate")[0]

@@ -12,8 +12,9 @@ import pytest
 from PIL import ExifTags, Image
 
 from reli3d.capture.capture import CaptureOptions, capture
-from reli3d.capture.photos import FRAME_COUNT, focal_from_exif, read_photos, sharpness
+from reli3d.capture.photos import FEWEST, FRAME_COUNT, focal_from_exif, read_photos, sharpness
 from reli3d.errors import InputError
+from reli3d.io.images import decode_image
 
 BASE = ExifTags.Base
 
@@ -148,6 +149,55 @@ def test_a_video_without_a_length_is_read_to_its_end_with_square_pixels(tmp_path
     assert photos[0].size == (427, 240) and any("HDR" in note for note in notes)
     last = np.asarray(Image.fromarray(textured(FRAME_COUNT - 1)).resize((427, 240)), np.float64)
     assert np.corrcoef(photos[-1].pixels.ravel(), last.ravel())[0, 1] > 0.8  # other frames: near 0
+
+
+@pytest.mark.parametrize("tagged", [False, True])
+def test_high_definition_video_without_a_color_space_is_bt_709(tmp_path, tagged):
+    path = tmp_path / "clip.mp4"
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("libx264", rate=30, options={"crf": "4"})
+        stream.width, stream.height, stream.pix_fmt = 1280, 720, "yuv420p"
+        if tagged:
+            stream.codec_context.colorspace = 1
+        image = Image.new("RGB", (1280, 720), (200, 40, 40))
+        for _ in range(FEWEST):
+            frame = av.VideoFrame.from_image(image)
+            file.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace="ITU709")))
+        file.mux(stream.encode())
+    photos, _ = read_photos(path, quiet)
+    assert np.abs(photos[0].pixels[300, 300].astype(int) - (200, 40, 40)).max() <= 3
+
+
+def display_p3() -> bytes:
+    """A matrix profile with the primaries of Display P3, adapted to D50, and an exponent of 2.2."""
+    number = lambda v: round(v * 65536).to_bytes(4, "big", signed=True)  # noqa: E731
+    xyz = lambda *v: b"XYZ \0\0\0\0" + b"".join(map(number, v))  # noqa: E731
+    columns = (0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)
+    curve = b"curv\0\0\0\0" + (1).to_bytes(4, "big") + round(2.2 * 256).to_bytes(2, "big") + b"\0\0"
+    name = b"Display P3\0"
+    text = b"desc\0\0\0\0" + len(name).to_bytes(4, "big") + name + b"\0" * (79 + -len(name) % 4)
+    tags = {b"desc": text, b"wtpt": xyz(0.9642, 1.0, 0.8249), **dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve)}
+    tags |= {key: xyz(*column) for key, column in zip((b"rXYZ", b"gXYZ", b"bXYZ"), columns, strict=True)}
+    table, data, at = len(tags).to_bytes(4, "big"), b"", 128 + 4 + 12 * len(tags)
+    for key, value in tags.items():
+        value += b"\0" * (-len(value) % 4)
+        table += key + (at + len(data)).to_bytes(4, "big") + len(value).to_bytes(4, "big")
+        data += value
+    header = (at + len(data)).to_bytes(4, "big") + b"\0\0\0\0" + b"\x02\x10\0\0" + b"mntrRGB XYZ "
+    header += b"\0" * 12 + b"acsp" + b"\0" * 28 + number(0.9642) + number(1.0) + number(0.8249)
+    return header.ljust(128, b"\0") + table + data
+
+
+def test_photographs_in_display_p3_are_converted(tmp_path):
+    """sRGB (200, 30, 30) lies at (183, 51, 42) there; an exponent of 2.2 differs from sRGB's curve by up to 6."""
+    for k in range(8):
+        Image.new("RGB", (320, 240), (183, 51, 42)).save(tmp_path / f"{k}.png", icc_profile=display_p3())
+    photos, notes = read_photos(tmp_path, quiet)
+    assert np.abs(photos[0].pixels[100, 100].astype(int) - (200, 30, 30)).max() <= 7
+    assert any("converted from Display P3 to sRGB; 8 of 8" in note for note in notes)
+    found = []
+    bitmap = decode_image(tmp_path / "0.png", notes=found)
+    assert np.array_equal(np.asarray(bitmap), photos[0].pixels) and "Display P3" in found[0]
 
 
 def test_the_sharpest_frame_of_each_window_of_a_video_is_taken(tmp_path):

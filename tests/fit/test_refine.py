@@ -59,7 +59,7 @@ def test_few_views_fit_the_light_and_keep_the_base_color(views):
     true = small_scene.two_colored(small_scene.ball())
     first = replace(true, environment=Environment(torch.full((16, 32, 3), 0.5)))
     three = {name: getattr(views, name)[:3] for name in ("images", "masks", "c2w", "intrinsics")}
-    few = replace(views, **three, names=())
+    few = replace(views, **three)
     off = []
     for weights in (Weights(), Weights(base_color=0.0)):
         result = fit.refine(first, few, steps=30, options=fit.RefineOptions(24, weights))

@@ -318,3 +318,16 @@ def test_hidden_nodes_are_not_read(tmp_path):
     quad.document["nodes"] += [hidden, {"mesh": 0}]
     quad.document["scenes"] = [{"nodes": [0, 1]}]
     assert quad.read(tmp_path)[1] == []  # one surface
+
+
+def test_colors_are_interpolated_in_linear_light(tmp_path):
+    """A texture of two texels, enlarged for a larger normal map: a quarter between black and white is linear 0.25."""
+    quad = Quad(pbrMetallicRoughness={})
+    color = np.array([[[0, 0, 0], [255, 255, 255]]] * 2, np.uint8)
+    quad.material()["pbrMetallicRoughness"]["baseColorTexture"] = quad.texture(color, wrapS=33071, wrapT=33071)
+    flat = np.full((8, 8, 3), (128, 128, 255), np.uint8)
+    quad.material()["normalTexture"] = quad.texture(flat, wrapS=33071, wrapT=33071)
+    asset, _ = quad.read(tmp_path)
+    row = asset.textures.base_color[4, :, 0]
+    expected = ((torch.arange(8) + 0.5) / 8 * 2 - 0.5).clamp(0.0, 1.0)  # texel centers at +0.5
+    near(row, expected, 1e-5)

@@ -92,3 +92,14 @@ def test_mirror_images_reach_the_losses_and_the_gradient(box, monkeypatch):
     (plain, gradient), (mirrored, other) = found[0.0], found[1.0]
     assert plain.keys() == mirrored.keys() and 0.0 < gradient != other > 0.0
     assert plain["occupancy"].item() != mirrored["occupancy"].item()
+
+
+def test_mirror_images_leave_the_maps_of_the_views_as_they_are(box, monkeypatch):
+    found = []
+    for probability in (0.0, 1.0):
+        monkeypatch.setattr(batches, "MIRROR_PROBABILITY", probability)
+        found.append(load_sample(box, 2, 512, np.random.default_rng(3)))
+    plain, mirrored = found
+    assert len(mirrored.mirrored_c2w) == 2 and len(plain.mirrored_c2w) == 0
+    for name in ("images", "masks", "view_material", "view_normal", "view_depth", "surface"):
+        assert torch.equal(getattr(plain, name), getattr(mirrored, name)), name

@@ -3,9 +3,11 @@
 import io
 import json
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from reli3d.errors import InputError
@@ -72,7 +74,8 @@ def neus(folder, rig, **changes):
         Image.fromarray((mask.numpy() * 255).astype(np.uint8)).convert("RGB").save(folder / f"mask/{j:03d}.png")
         image = Image.open(folder / f"image/{j:06d}.png").convert("RGB")
         image.save(folder / f"image/{j:06d}.png")
-    np.savez(folder / "cameras_sphere.npz", **{**projections(rig, np.array([3.0, -40.0, 700.0]), 25.0), **changes})
+    whole = replace(rig, intrinsics=rig.intrinsics - torch.tensor([0.0, 0.0, 0.5, 0.5]))  # NeuS' pixel centers
+    np.savez(folder / "cameras_sphere.npz", **{**projections(whole, np.array([3.0, -40.0, 700.0]), 25.0), **changes})
 
 
 def test_neus(tmp_path, rig):

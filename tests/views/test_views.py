@@ -5,7 +5,9 @@ import pytest
 import torch
 
 from reli3d.geometry.camera import project
+from reli3d.geometry.hull import mask_distance
 from reli3d.pipeline import refine
+from reli3d.render.color import srgb_to_linear
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import MASK_EDGE, Views, mask_box
 from tests.support.rigs import sphere_views
@@ -125,7 +127,7 @@ def test_views_are_checked():
         empty.resampled(32)
 
 
-def test_cut_off_views_are_left_out_of_a_refinement_while_eight_remain(monkeypatch):
+def test_cut_off_views_are_left_out_of_a_refinement_while_three_remain(monkeypatch):
     views = sphere_views(count=9, size=(64, 64))
     cut_off = (torch.ones_like(views.masks[0]), *views.masks[1:])
     fitted = []
@@ -134,6 +136,27 @@ def test_cut_off_views_are_left_out_of_a_refinement_while_eight_remain(monkeypat
     )
     asset = SimpleNamespace(mesh=SimpleNamespace(vertices=torch.zeros(1, 3)), asset=None)
     refine(asset, replace(views, masks=cut_off), steps=1, light=list(range(9)))
-    refine(asset, replace(views, masks=cut_off).select(8), steps=1)
-    assert [len(batch) for batch, _ in fitted] == [8, 8] and fitted[0][1]["light"] == list(range(1, 9))
-    assert torch.equal(fitted[0][0].c2w, views.c2w[1:]) and torch.equal(fitted[1][0].c2w, views.c2w[:8])
+    refine(asset, replace(views, masks=cut_off).select(3), steps=1)  # two others
+    assert [len(batch) for batch, _ in fitted] == [8, 3] and fitted[0][1]["light"] == list(range(1, 9))
+    assert torch.equal(fitted[0][0].c2w, views.c2w[1:]) and torch.equal(fitted[1][0].c2w, views.c2w[:3])
+
+
+def test_linear_averages_are_those_of_light():
+    checkers = (torch.arange(64)[:, None] + torch.arange(64)) % 2
+    image = checkers[..., None].expand(-1, -1, 3).float()
+    views = Views((image,), (torch.ones(64, 64),), torch.eye(4)[None], torch.tensor([[64.0, 64, 32, 32]]), ("a",))
+    mean = views.resampled(8, crop=False, linear=True).images
+    torch.testing.assert_close(srgb_to_linear(mean)[:, 2:-2, 2:-2], torch.full((1, 4, 4, 3), 0.5), rtol=0, atol=0.02)
+
+
+def test_the_silhouette_of_a_cut_off_object_continues_beyond_the_image():
+    """A disk of radius 40 around the lower edge's middle: the half below the image is not cut away."""
+    x, y = torch.meshgrid(torch.arange(160) + 0.5, torch.arange(100) + 0.5, indexing="xy")
+    mask = ((x - 80) ** 2 + (y - 100) ** 2 < 40**2).float()
+    views = Views((torch.zeros(100, 160, 3),), (mask,), torch.eye(4)[None], torch.tensor([[90.0, 90, 80, 50]]), ("a",))
+    batch = views.resampled(93)  # one pixel each
+    assert float(batch.masks[0].sum()) == pytest.approx(float(mask.sum()), rel=0.01)
+    beyond = batch.silhouettes[0] - batch.masks[0]
+    assert float(beyond.sum()) > 80 and float(mask_distance(batch.silhouettes)[0][beyond > 0.5].min()) > 0
+    whole = replace(views, masks=(mask.roll(-50, 0),)).resampled(93)
+    assert torch.equal(whole.masks, whole.silhouettes)
