@@ -15,6 +15,7 @@ from reli3d.io.glb import write_glb
 from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions
 from tests.support import small_scene
+from tests.support.meshes import mesh_of
 
 
 def sphere(radius, count=20_000, seed=0):
@@ -33,9 +34,13 @@ def test_chamfer_and_f_score_of_two_spheres():
 
 
 def test_surface_samples_lie_on_the_surface_evenly():
-    points = surface_samples(small_scene.ball().mesh, 4000)
-    radius = np.linalg.norm(points, axis=1)
-    assert np.ptp(radius) < 0.03 and float(np.abs(points.mean(0)).max()) < 0.03 * radius.mean() * 2
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    mesh = mesh_of(np.concatenate([corners, corners / 3 + (2, 0, 1)]), np.arange(6).reshape(2, 3))  # areas 9 to 1
+    points = surface_samples(mesh, 4000)
+    large = points[:, 2] < 0.5
+    assert abs(large.mean() - 0.9) < 0.02  # four standard deviations, as below
+    assert np.abs(points[large].mean(0) - (1 / 3, 1 / 3, 0)).max() < 0.016 and (points[large] >= 0).all()
+    assert abs((points[large, :2] ** 2).mean() - 1 / 6) < 0.012
 
 
 def test_psnr_and_ssim_of_known_images():

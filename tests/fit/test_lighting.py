@@ -1,5 +1,6 @@
 """Lighting that moves with the camera or differs between groups of views is recovered, and relights as a fixed one."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -17,12 +18,13 @@ from reli3d.fit.maps import FixedSurface
 from reli3d.fit.refine import RefineOptions, refine
 from reli3d.fit.transfer import changed
 from reli3d.fit.unknowns import Start, Unknowns
-from reli3d.geometry.camera import Camera
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.rays import RayScene
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import primary_hits
 from reli3d.render.image import render_asset
+from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 from reli3d.render.shading import ShadeOptions
 from reli3d.views.views import ViewBatch
 from tests.support import small_scene
@@ -161,3 +163,17 @@ def test_light_that_moves_with_the_camera_is_reported():
     views = ViewBatch(linear_to_srgb(images.color), images.mask, images.camera.c2w, images.camera.intrinsics)
     notes = refine(small_scene.ball(), views, steps=1, options=RefineOptions(16)).notes
     assert any("set light to camera" in note for note in notes)
+
+
+def test_the_start_of_a_light_that_moves_with_the_camera_is_in_its_axes():
+    """Cameras on a ring 45 degrees above the object see a light from above at (0, 1, 1) / sqrt(2)."""
+    azimuth = torch.arange(6) * (math.pi / 3)
+    eyes = torch.stack([azimuth.sin(), torch.ones(6), azimuth.cos()], -1)
+    c2w = torch.stack([look_at(eye) for eye in eyes])
+    light = 0.1 + 5.0 * (lat_long_directions(64)[..., 1:2] > 0.95).float().expand(-1, -1, 3)
+    ball = replace(small_scene.ball(), environment=Environment(light.contiguous()))
+    start = Start.of(ball, c2w=c2w).light.exp()[..., 0]
+    weight = (start > 1.0).float() * texel_solid_angles(*start.shape).to(start)
+    mean = (lat_long_directions(start.shape[0]) * weight[..., None]).sum((0, 1))
+    expected = torch.tensor([0.0, 0.5**0.5, 0.5**0.5])
+    assert float(normalize(mean, dim=0) @ expected) > math.cos(math.radians(3.0))  # half a texel

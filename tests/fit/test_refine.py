@@ -196,7 +196,3 @@ def test_maps_move_to_another_surface():
     moved = transfer_textures(small_scene.ball(squeeze=0.96).mesh, colored, small_scene.TEXELS)
     # texels blend over the seam of the two colors, a small part of each half
     assert torch.allclose(half_colors(moved), half_colors(colored), atol=0.02)
-
-
-def test_weights_name_every_term_once():
-    assert all(value >= 0.0 for value in vars(Weights()).values())
