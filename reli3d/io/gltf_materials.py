@@ -101,6 +101,8 @@ class Materials:
         uv = coordinates(next(iter(channels), 0))
         if not layouts:
             return self._kept(index, material), uv
+        if len(layouts) == 1:
+            self._kept(index, material)  # its errors come first
         if uv is None:
             name = f"TEXCOORD_{channels.pop()}"
             self.document.fail(f"{field[: -len('.material')]}.attributes", f"expected {name} for its texture", None)

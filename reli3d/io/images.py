@@ -18,7 +18,7 @@ import torch
 from PIL import Image, ImageCms, ImageOps
 from torch import Tensor
 
-from reli3d.errors import InputError, shown
+from reli3d.errors import InputError, printable, shown
 from reli3d.io.files import file_size, write_bytes
 from reli3d.io.hdr import write_exr, write_hdr
 from reli3d.render.color import linear_to_srgb
@@ -175,7 +175,7 @@ def in_srgb(image: Image.Image, name: str, notes: list[str]) -> Image.Image:
     except (ImageCms.PyCMSError, OSError, ValueError, TypeError) as error:
         notes.append(f"{name}: its color profile is not used ({shown(str(error))}), sRGB is assumed")
         return image
-    notes.append(f"{name}: colors converted from {shown(title)} to sRGB")
+    notes.append(f"{name}: colors converted from {printable(title)} to sRGB")
     return converted or image
 
 

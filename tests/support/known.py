@@ -296,7 +296,7 @@ def benchmarks(rng: Random) -> Case:
     else:
         arrays, scale = {}, np.diag([1.5, 1.5, 1.5, 1.0])
         scale[:3, 3] = [rng.uniform(-0.2, 0.2) for _ in range(3)]
-        k3 = np.array([[fx, 0.0, width / 2], [0.0, fx, height / 2], [0.0, 0.0, 1.0]])
+        k3 = np.array([[fx, 0.0, (width - 1) / 2], [0.0, fx, (height - 1) / 2], [0.0, 0.0, 1.0]])  # as NeuS writes it
         for k, pose in enumerate(poses):
             name = f"image/{k:03d}.png"
             files[name] = rgba(rng, width, height)
