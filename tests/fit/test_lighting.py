@@ -173,7 +173,7 @@ def test_the_start_of_a_light_that_moves_with_the_camera_is_in_its_axes():
     light = 0.1 + 5.0 * (lat_long_directions(64)[..., 1:2] > 0.95).float().expand(-1, -1, 3)
     ball = replace(small_scene.ball(), environment=Environment(light.contiguous()))
     start = Start.of(ball, c2w=c2w).light.exp()[..., 0]
-    weight = (start > 1.0).float() * texel_solid_angles(*start.shape).to(start)
+    weight = (start > 1.0).float() * texel_solid_angles(*start.shape).to(start)[:, None]
     mean = (lat_long_directions(start.shape[0]) * weight[..., None]).sum((0, 1))
     expected = torch.tensor([0.0, 0.5**0.5, 0.5**0.5])
     assert float(normalize(mean, dim=0) @ expected) > math.cos(math.radians(3.0))  # half a texel
