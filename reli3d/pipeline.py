@@ -415,9 +415,10 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     between start and fit with the first weights for which the mean PSNR over fitted, held-out and all views is not
     lower than the start's, within a small tolerance; if there are none, the result is ``asset``.
 
-    views: in the frame of ``asset``.  seconds, steps: the budget, exactly one; with ``steps`` the result is
-    reproducible.  options: see :class:`reli3d.fit.refine.RefineOptions`.  Returns a new asset without gradients.
-    Raises TypeError for a wrong type, ValueError unless exactly one of ``seconds`` and ``steps`` is given.
+    views: in the frame of ``asset``; those that cut the object off are left out while three others remain.  seconds,
+    steps: the budget, exactly one; with ``steps`` the result is reproducible.  options: see
+    :class:`reli3d.fit.refine.RefineOptions`.  Returns a new asset without gradients.  Raises TypeError for a wrong
+    type, ValueError unless exactly one of ``seconds`` and ``steps`` is given.
 
     >>> views = reli3d.load_views("photos/shoe", every=True)
     >>> asset = reli3d.refine(reli3d.reconstruct(views.taken()), views, seconds=60)
@@ -453,9 +454,9 @@ class FolderOptions:
     """Which images of a folder :func:`reconstruct_folder` reads, and whether it refines the result.
 
     views, masks, remove_background: as in :func:`~reli3d.views.folder.load_views`.  budget: ``seconds`` or ``steps`` of
-    a refinement on all images; empty: no refinement.  cameras: also optimize the cameras.  interrupt: as in
-    :func:`reli3d.fit.refine.refine`.  light: ``object``, ``camera`` or ``per-group`` (one lighting per sub-folder of
-    images); None: read from the folder.
+    a refinement on all images that show the whole object; empty: none.  cameras: also optimize the cameras.
+    interrupt: as in :func:`reli3d.fit.refine.refine`.  light: ``object``, ``camera`` or ``per-group`` (one lighting per
+    sub-folder of images); None: read from the folder.
     """
 
     views: int | None = None
@@ -500,7 +501,7 @@ def reconstruct_folder(
 ) -> None:
     """Reconstructs the object of ``folder``, refines it if ``reading`` has a budget, and writes the result.
 
-    name: title of the viewer page.  replacing: from :func:`reli3d.output.results.claim`.  weights: record of the
+    name: title of the viewer page.  replacing: from :func:`reli3d.output.folder.claimed`.  weights: record of the
     weights for ``run_info.json``.  Raises InputError, with the likely cause if the cameras are implausible, and
     OSError; an earlier result is then kept.
     """
@@ -514,9 +515,13 @@ def reconstruct_folder(
         views, batch = photographs.taken(), None
         fit: dict[str, Any] = {}
         if reading.budget:
-            photographs = photographs.select(whole_views(photographs.masks, LEAST_REFINED))
+            lighting, whole_ones = reading.lighting(photographs), whole_views(photographs.masks, LEAST_REFINED)
+            if left_out := len(photographs) - len(whole_ones):
+                progress.report([f"refinement: {left_out} images that cut the object off are left out"])
+            photographs = photographs.select(whole_ones)
             batch, names = photographs.resampled(REFINED, linear=True), photographs.names
-            fit = {"light": reading.lighting(photographs), "cameras": reading.cameras, **reading.budget}
+            light = lighting if isinstance(lighting, str) else [lighting[i] for i in whole_ones]
+            fit = {"light": light, "cameras": reading.cameras, **reading.budget}
         del photographs  # 1 GB of 60 images of 1 MP
     if options.up == "y" and (axis := up_axis(views.c2w)) not in (None, "y"):
         views = replace(views, notes=(*views.notes, f"the cameras suggest {axis} as the up axis: try --up {axis}"))
@@ -537,7 +542,8 @@ def reconstruct_folder(
             compared = comparison(asset, result.asset, shown.to(model.device))
         progress.report(result.notes)
         first, asset = asset if result.changed else None, result.asset
-        record = {"refinement": {"views": len(batch), **(reading.budget or {}), **result.record()}}
+        fitted = {"views": len(batch), "view_names": list(names), **(reading.budget or {})}
+        record = {"refinement": fitted | result.record()}
     with watch.stage("preview"):
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
         frames, moved = results.frame_record(placed.model_from_input, output, views.origin, options.up)

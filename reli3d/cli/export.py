@@ -10,7 +10,8 @@ from reli3d.cli.exit_codes import Parser, check_range, command, extra
 from reli3d.errors import InputError
 
 FORMATS = ("glb", "obj", "usdz")
-BAKED, LEAST_BAKED = 1024, 128  # texels a side of a new atlas, unless the source has LEAST_BAKED or more
+DEFAULT_TEXELS = 1024  # per side of a new atlas
+MIN_SOURCE_TEXELS = 128  # a smaller source does not set the size of a new atlas
 
 
 def parser() -> argparse.ArgumentParser:
@@ -35,7 +36,11 @@ def parser() -> argparse.ArgumentParser:
         metavar="N",
         help="reduce to at most N triangles, 16 to 10^7, with a new texture atlas (pip install 'reli3d[mesh]')",
     )
-    p.add_argument("--texture-size", type=int, help="texels per side, 64 to 4096 (default: as in the GLB)")
+    p.add_argument(
+        "--texture-size",
+        type=int,
+        help="texels per side, 64 to 4096 (default: as in the GLB, or 1024 for a new atlas of textures below 128)",
+    )
     p.add_argument(
         "--textures",
         choices=("png", "webp"),
@@ -84,7 +89,7 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
         raise InputError(args.glb, f"expected a GLB with one surface, got {len(parts)}")
     asset = parts[0]
     size = args.texture_size or asset.textures.size
-    baked = size if args.texture_size or size >= LEAST_BAKED else BAKED
+    baked = size if args.texture_size or size >= MIN_SOURCE_TEXELS else DEFAULT_TEXELS
     if args.decimate is not None and len(asset.mesh.faces) > args.decimate:
         with extra("--decimate"):
             mesh = decimate(asset.mesh, args.decimate)

@@ -50,8 +50,6 @@ def transfer_textures(mesh: Mesh, source: Asset, size: int, *, shape: bool = Fal
     shape: whether shading normals show the shape of ``source``, of which ``mesh`` is an approximation; otherwise its
     normal map alone is transferred.
     """
-    if (factor := source.textures.size // size) > 1:
-        source = replace(source, textures=_reduced(source.textures, factor))
     mesh = unwrap(mesh, texture_size=size)
     mesh = replace(mesh.with_tangents(), colors=None)  # vertex colors are baked into the maps below
 
@@ -65,19 +63,16 @@ def transfer_textures(mesh: Mesh, source: Asset, size: int, *, shape: bool = Fal
         )
         return _maps(replace(old, normal=unit(normal + bump)), normal, tangent)
 
-    baked = bake(mesh, size, at_texels, tangents=True, chunk=size * size)
-    return Asset(mesh, _textures(baked), source.environment)
+    factor = max(1, source.textures.size // size)  # smaller textures are averages
+    baked = bake(mesh, factor * size, at_texels, tangents=True, chunk=size * size)
+    return Asset(mesh, _textures({name: _means(v, factor) for name, v in baked.items()}), source.environment)
 
 
-def _reduced(maps: TextureSet, factor: int) -> TextureSet:
-    """Means over squares of ``factor`` texels."""
-
-    def mean(values: Tensor) -> Tensor:
-        planes = values.reshape(*values.shape[:2], -1).permute(2, 0, 1)[None]
-        return torch.nn.functional.avg_pool2d(planes, factor)[0].permute(1, 2, 0)
-
-    names = "base_color", "roughness", "metallic", "normal"
-    return TextureSet(**{name: mean(getattr(maps, name)) for name in names}, wrap=maps.wrap)
+def _means(values: Tensor, factor: int) -> Tensor:
+    """Means over squares of ``factor`` texels of a map ``(T, T, C)``."""
+    if factor == 1:
+        return values
+    return torch.nn.functional.avg_pool2d(values.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0).contiguous()
 
 
 def changed(asset: Asset, unknowns: Unknowns) -> Asset:

@@ -109,7 +109,8 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     for corner in faces.long().T.contiguous():  # index_add is about 10 times slower with int32
         total = total.index_add(0, corner, per_face)
     square = (total * total).sum(-1, keepdim=True)
-    least = (RELATIVE_NORMAL_MIN * square.detach().amax(0)).clamp(max=NORMAL_MIN) if len(square) else NORMAL_MIN
+    largest = square.detach().nan_to_num(0.0).amax(0) if len(square) else square.new_zeros(1)
+    least = (RELATIVE_NORMAL_MIN * largest).clamp(max=NORMAL_MIN)
     valid = square > least
     unit = total * torch.rsqrt(torch.where(valid, square, 1.0))
     return torch.where(valid, unit, unit.new_tensor([0.0, 0.0, 1.0]))

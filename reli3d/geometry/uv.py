@@ -65,7 +65,7 @@ def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
     Accepts any triangle mesh: open, non-manifold, disconnected, with degenerate faces.  Deterministic.
 
     Gradients pass through vertices and normals; ``uv`` has none.  Raises TypeError for a wrong type; ValueError for a
-    mesh without faces, non-finite vertices, or a texture size out of range.
+    mesh without faces, non-finite vertices, or a texture size out of range or too small for the charts.
 
     >>> charted = reli3d.unwrap(mesh, texture_size=64)
     >>> maps = reli3d.bake(charted, 64, lambda position, normal: position.abs())

@@ -38,7 +38,10 @@ UNTURNED = {  # what restores the stored pixels
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_270,
 }
-_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # of a JPEG segment; others are part of the scan's data
+CONVERTED = " to sRGB"  # end of the note on a converted image
+_MARKER = re.compile(
+    rb"\xff[^\x00\xd0-\xd7\xff]"
+)  # of a JPEG segment: 0 and restarts are part of a scan's data, more 0xff are fill bytes
 ASPECT = 0.01  # relative difference up to which two sizes have the same aspect
 _TOP = {"L": 255, "RGB": 255, "RGBA": 255, "F": 65535}  # mode: the value that is 1
 _DECODING = BoundedSemaphore(2)  # images at a time: one of 24 MP takes 96 MB
@@ -172,10 +175,10 @@ def in_srgb(image: Image.Image, name: str, notes: list[str]) -> Image.Image:
             return image
         target = ImageCms.createProfile("sRGB")
         converted = ImageCms.profileToProfile(image, source, target, outputMode=image.mode)
-    except (ImageCms.PyCMSError, OSError, ValueError, TypeError) as error:
+    except (ImageCms.PyCMSError, ImportError, OSError, ValueError, TypeError) as error:
         notes.append(f"{name}: its color profile is not used ({shown(str(error))}), sRGB is assumed")
         return image
-    notes.append(f"{name}: colors converted from {printable(title)} to sRGB")
+    notes.append(f"{name}: colors converted from {printable(title)}{CONVERTED}")
     return converted or image
 
 
@@ -197,12 +200,9 @@ def _scans(path) -> int:
     """Scans of a JPEG file, without what follows its end; each passes over the whole image."""
     data = Path(path).read_bytes()
     at, scans = 2, 0
-    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xD9:
-        scan, at = data[at + 1] == 0xDA, at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-        scans += scan
-        if scan:
-            marker = _MARKER.search(data, at)
-            at = marker.start() if marker else len(data)
+    while (marker := _MARKER.search(data, at)) and data[marker.end() - 1] != 0xD9:
+        scans += data[marker.end() - 1] == 0xDA
+        at = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
     return scans
 
 

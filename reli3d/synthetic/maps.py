@@ -13,7 +13,7 @@ from reli3d.io.files import file_size
 from reli3d.render.latlong import lat_long_directions, quarter_turn, texel_solid_angles
 
 ROWS = 64
-# of numpy, zipfile and zlib for a cut, changed, encrypted or unknown file; the second and third of an .npy file
+# of numpy, zipfile and zlib for a cut, changed, encrypted or unknown file; TypeError and AttributeError: an .npy file
 BROKEN_ARCHIVE = (
     ValueError,
     TypeError,

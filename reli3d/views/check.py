@@ -93,8 +93,10 @@ def agreement(views: Views) -> tuple[Hull, list[float]]:
 def _filled(hull: Hull, mask: Tensor, pose: Tensor, camera: Tensor) -> float:
     pixels, depth = project(hull.points.float(), pose.float().cpu(), camera.float().cpu())
     height, width = mask.shape
-    footprint = float(camera[:2].max()) * hull.cell / max(float(depth.median()), 1e-12)  # of a cell
-    step = max(1, min(math.ceil(footprint), max(height, width)))  # without end where the camera is inside the object
+    if float(depth.median()) <= 0.0:  # the camera is inside the object
+        return 0.0
+    footprint = float(camera[:2].max()) * hull.cell / float(depth.median())  # of a cell
+    step = max(1, math.ceil(min(footprint, max(height, width))))
     blocks = max_pool2d(pad(mask.cpu(), (0, -width % step, 0, -height % step))[None], step)[0] > 0.5
     inside = (pixels >= 0).all(-1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     hit = torch.zeros(blocks.shape, dtype=torch.float32, device="cpu")

@@ -1,4 +1,4 @@
-"""File names regardless of case: image suffixes and lookup."""
+"""File names regardless of case and Unicode form: image suffixes and lookup."""
 
 import os
 import unicodedata
@@ -11,7 +11,7 @@ ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
 
 class FolderIndex:
-    """Cached folder listings: finds files by exact name, else regardless of case."""
+    """Cached folder listings: finds files by exact name, else regardless of case and Unicode form."""
 
     def __init__(self) -> None:
         self._names: dict[str, dict[str, list[str]]] = {}
@@ -61,7 +61,7 @@ def named(folder: Path, names: Sequence[str]) -> list[str]:
 
 def images_in(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
     """The files of ``folder`` with one of ``endings`` in any case, sorted; empty if the folder does not exist."""
-    there = (folder / name for name in _listed(folder) if not name.startswith("."))  # not those of macOS
+    there = (folder / name for name in _listed(folder) if not name.startswith("."))  # such as ._a.png of macOS
     return sorted(p for p in there if p.suffix.lower() in endings and p.is_file())
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from reli3d._bridge import full_precision, present
 from reli3d.errors import InputError, printable, shown
-from reli3d.io.images import ASPECT, above, color_of, decode_image, unit
+from reli3d.io.images import ASPECT, CONVERTED, above, color_of, decode_image, unit
 from reli3d.views.array_cameras import NEUS, read_llff, read_neus
 from reli3d.views.background import Remover
 from reli3d.views.choose import DUPLICATE_DISTANCE_RAD, choose_views, spread_notes
@@ -96,7 +96,10 @@ def load_views(
         usable = others if len(others) >= LEAST_WHOLE else list(range(len(frames)))
     frames, loaded = [frames[i] for i in kept], [read[i] for i in kept]
     notes += choice + [note for frame in frames for note in frame.notes] + _cut_off(names, cut_off, usable)
-    notes += [note for *_, found, _ in loaded for note in found]
+    of_images = [note for *_, found, _ in loaded for note in found]
+    converted = [note for note in of_images if note.endswith(CONVERTED)]
+    notes += [note for note in of_images if not note.endswith(CONVERTED)]
+    notes += [f"{converted[0]}; {len(converted)} of {len(loaded)} such images"] if converted else []
     check_one_label(root, notes)
     if reduced := sum(smaller for *_, smaller in loaded):
         part = f"scaled down to {MAX_FULL_PIXELS} pixels"

@@ -12,9 +12,9 @@ from reli3d.errors import InputError
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import Views, mask_box, whole_views
 
-RADIUS = 0.87  # half side of the network's cube
-LONGEST = 0.8, 1.15  # longest side of a hull whose poses are kept; in training the object's is 1
-REACH = 0.62  # its greatest coordinate: a tenth more than the side of the network's feature volume
+RADIUS = 0.87  # half side of the network's cube, and of the sphere in which pixels have depths
+KEPT_HULL_SIDE = 0.8, 1.15  # longest side of a hull whose poses are kept; in training the object's is 1
+MAX_HULL_COORDINATE = 0.62  # its greatest coordinate: a tenth more than the side of the network's feature volume
 GRIDS = (24, 44)  # cells a side, coarse and refined: the last is 2 to 3 % of the object
 BALL = 1.3  # diameter of the ball that limits the hull, in mask widths: a generic view shows 0.8 of the longest side
 ONE_SIDED = math.radians(90.0)  # between eyes: beyond it the views bound each other's depth
@@ -48,7 +48,7 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
 
     mode ``none``: identity.  ``hull``: the visual hull's box is centered, its longest side scaled to 1, as in
     training.  ``auto``: the same with ``views.object_box`` if there is one; else the identity if the longest side of
-    the hull is 0.8 to 1.15 and its coordinates are at most 0.62, about as in training; else ``hull``.
+    the hull is 0.8 to 1.15, its coordinates are at most 0.62 and it lies in a sphere of radius 0.87; else ``hull``.
 
     With all cameras within 90 degrees, the hull is cut at 1.3 times the width of the masks and the box aligned with the
     mean viewing direction.  From one direction, the depth is the width, nearest to the origin.  Raises InputError if no
@@ -64,12 +64,15 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
         return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64, device="cpu"), -(low + high) / (2 * longest))
     hull = visual_hull(views)
     low, high = hull.box()
-    inside = float(torch.maximum(-low, high).max()) <= REACH and float(hull.points.norm(dim=-1).max()) <= RADIUS
+    inside = (
+        float(torch.maximum(-low, high).max()) <= MAX_HULL_COORDINATE
+        and float(hull.points.norm(dim=-1).max()) <= RADIUS
+    )
     basis = _one_sided_basis(views, hull)
     points = hull.points @ basis
     low, high = points.amin(0), points.amax(0)
     longest, center = float((high - low).max()), basis @ ((low + high) / 2)
-    if mode == "auto" and inside and LONGEST[0] <= longest <= LONGEST[1]:
+    if mode == "auto" and inside and KEPT_HULL_SIDE[0] <= longest <= KEPT_HULL_SIDE[1]:
         return Similarity.identity()
     return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64, device="cpu"), -center / longest)
 

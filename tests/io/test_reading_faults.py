@@ -127,8 +127,15 @@ def test_a_thousand_scans_are_refused_and_ten_are_not(tmp_path):
     data = (tmp_path / "a.jpg").read_bytes()
     last = data.rindex(b"\xff\xda")
     (tmp_path / "b.jpg").write_bytes(data[:last] + data[last:-2] * 1000 + data[-2:])
-    with pytest.raises(InputError, match="scans"):
-        read_image(tmp_path / "b.jpg")
+    many = (tmp_path / "b.jpg").read_bytes()
+    for name, filled in (
+        ("b", many),
+        ("c", many[:2] + b"\xff" + many[2:]),
+        ("d", many.replace(b"\xff\xda", b"\xff\xff\xda")),
+    ):
+        (tmp_path / f"{name}.jpg").write_bytes(filled)  # markers may follow fill bytes
+        with pytest.raises(InputError, match="scans"):
+            read_image(tmp_path / f"{name}.jpg")
 
 
 def glb(path, **document):
