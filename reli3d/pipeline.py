@@ -7,7 +7,7 @@ writes the result.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -411,24 +411,30 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
     """Refines mesh, maps and lighting of ``asset`` by inverse rendering of ``views``.
 
-    The colors of some views are held out (:func:`reli3d.fit.refine.held_out`).  Material and lighting are each blended
-    between start and fit with the first weights for which the mean PSNR over fitted, held-out and all views is not
-    lower than the start's, within a small tolerance; if there are none, the result is ``asset``.
+    The colors of :func:`reli3d.fit.refine.held_out` views are held out.  Material and lighting are each blended between
+    start and fit with the first weights for which no mean PSNR (fitted, held-out, all views) is below the start's, with
+    small tolerance; if there are none, the result is ``asset``.
 
     views: in the frame of ``asset``; those that cut the object off are left out while three others remain.  seconds,
     steps: the budget, exactly one; with ``steps`` the result is reproducible.  options: see
-    :class:`reli3d.fit.refine.RefineOptions`.  Returns a new asset without gradients.  Raises TypeError for a wrong
-    type, ValueError unless exactly one of ``seconds`` and ``steps`` is given.
+    :class:`reli3d.fit.refine.RefineOptions`.  The result has no gradients.  Raises TypeError for a wrong type,
+    ValueError for both or no budget.
 
     >>> views = reli3d.load_views("photos/shoe", every=True)
     >>> asset = reli3d.refine(reli3d.reconstruct(views.taken()), views, seconds=60)
     """
     options = {"light": views.lighting, **options}
-    whole = whole_views(views.masks, LEAST_REFINED)
-    if not isinstance(options["light"], str) and len(options["light"]) == len(views):
-        options["light"] = [options["light"][i] for i in whole]
-    batch = views.select(whole).to(asset.mesh.vertices.device).resampled(REFINED, linear=True)
+    views, options["light"] = _complete_views(views, options["light"])
+    batch = views.to(asset.mesh.vertices.device).resampled(REFINED, linear=True)
     return _refined(asset, batch, seconds=seconds, steps=steps, **options).asset
+
+
+def _complete_views(views: Views, light: str | Sequence) -> tuple[Views, str | Sequence]:
+    """The views that show the whole object while LEAST_REFINED do, else all, and their entries of ``light``."""
+    chosen = whole_views(views.masks, LEAST_REFINED)
+    if not isinstance(light, str) and len(light) == len(views):
+        light = [light[i] for i in chosen]
+    return views.select(chosen), light
 
 
 def _refined(asset: Asset, batch: ViewBatch, *, seconds: float | None = None, steps: int | None = None,
@@ -515,12 +521,12 @@ def reconstruct_folder(
         views, batch = photographs.taken(), None
         fit: dict[str, Any] = {}
         if reading.budget:
-            lighting, whole_ones = reading.lighting(photographs), whole_views(photographs.masks, LEAST_REFINED)
-            if left_out := len(photographs) - len(whole_ones):
-                progress.report([f"refinement: {left_out} images that cut the object off are left out"])
-            photographs = photographs.select(whole_ones)
-            batch, names = photographs.resampled(REFINED, linear=True), photographs.names
-            light = lighting if isinstance(lighting, str) else [lighting[i] for i in whole_ones]
+            complete, light = _complete_views(photographs, reading.lighting(photographs))
+            if left_out := len(photographs) - len(complete):
+                note = f"refinement: {left_out} images that cut the object off are left out"
+                views = replace(views, notes=(*views.notes, note))
+            batch, names = complete.resampled(REFINED, linear=True), complete.names
+            del complete
             fit = {"light": light, "cameras": reading.cameras, **reading.budget}
         del photographs  # 1 GB of 60 images of 1 MP
     if options.up == "y" and (axis := up_axis(views.c2w)) not in (None, "y"):

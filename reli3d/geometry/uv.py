@@ -57,15 +57,15 @@ def _check(mesh: Mesh, texture_size: int) -> None:
 
 
 def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
-    """Adds a texture atlas to a mesh: ``uv (V', 2)`` in [0, 1], u right, v down, without overlap.
+    """Adds an atlas to a mesh: ``uv (V', 2)`` in [0, 1], u right, v down, without overlap.
 
     texture_size: 16 to 16384 texels per side; determines the gaps between charts, see
     :func:`~reli3d.geometry.uv.guard_band`.  Vertices are split at chart borders; faces keep their order, and each has
-    positive UV area.  Normals are kept, or computed before the split, so that shading stays smooth across charts.
+    positive UV area.  Normals are kept, or computed before the split: shading stays smooth across charts.
     Accepts any triangle mesh: open, non-manifold, disconnected, with degenerate faces.  Deterministic.
 
-    Gradients pass through vertices and normals; ``uv`` has none.  Raises TypeError for a wrong type; ValueError for a
-    mesh without faces, non-finite vertices, or a texture size out of range or too small for the charts.
+    Gradients pass through vertices and normals; ``uv`` has none.  Raises TypeError for a wrong type; ValueError for no
+    faces, non-finite vertices, or a texture size out of range or too small for the charts.
 
     >>> charted = reli3d.unwrap(mesh, texture_size=64)
     >>> maps = reli3d.bake(charted, 64, lambda position, normal: position.abs())

@@ -231,16 +231,14 @@ def read_glb(
 ) -> list[Asset]:
     """Reads a GLB file: one :class:`Asset` per primitive, in scene coordinates, without environment.
 
-    Node transforms, skins in the rest pose and morph targets with their default weights are applied.  Vertex colors
-    become ``Mesh.colors``, or are multiplied into the textures if uniform.  Textures are resampled to squares of equal
-    size, with all factors and texture transforms applied.  Missing normals become face normals; missing tangents are
-    computed by MikkTSpace.  Specular-glossiness materials are converted.
+    Node transforms, skins at rest and default morph targets are applied.  Vertex colors become ``Mesh.colors``; one
+    color multiplies the textures.  Textures become squares of equal size, with factors and transforms applied.  Missing
+    normals are those of faces, tangents MikkTSpace's.  Specular-glossiness is converted.
 
-    notes: receives one line for every feature that is ignored (animation, emission, occlusion, alpha, points, lines,
-    extensions such as clearcoat).  origin: an empty list, which receives the position (x, y, z) of the first mesh's
-    node; vertices are relative to it, so that those far from the scene's origin keep their float32 digits.  Compressed
-    data (Draco, meshopt, KTX2) is an error.  limits: see :func:`reli3d.io.gltf_parts.read_parts`.  Raises InputError, a
-    ValueError, naming field, value and fix.
+    notes: receives a line for every ignored feature (animation, emission, occlusion, alpha, points, lines, extensions).
+    origin: an empty list, which receives the position (x, y, z) of the first mesh's node; vertices are relative to it,
+    so those far away keep their digits.  limits: see :func:`reli3d.io.gltf_parts.read_parts`.  Raises
+    InputError (field, value, fix), also for compressed data (Draco, meshopt, KTX2).
 
     >>> reli3d.write_glb("object.glb", asset)
     >>> parts = reli3d.read_glb("object.glb")

@@ -39,9 +39,7 @@ UNTURNED = {  # what restores the stored pixels
     8: Image.Transpose.ROTATE_270,
 }
 CONVERTED = " to sRGB"  # end of the note on a converted image
-_MARKER = re.compile(
-    rb"\xff[^\x00\xd0-\xd7\xff]"
-)  # of a JPEG segment: 0 and restarts are part of a scan's data, more 0xff are fill bytes
+_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # start of a JPEG segment; other bytes after 0xff are data
 ASPECT = 0.01  # relative difference up to which two sizes have the same aspect
 _TOP = {"L": 255, "RGB": 255, "RGBA": 255, "F": 65535}  # mode: the value that is 1
 _DECODING = BoundedSemaphore(2)  # images at a time: one of 24 MP takes 96 MB

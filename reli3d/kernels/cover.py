@@ -12,6 +12,7 @@ from reli3d.kernels.projection import project_point
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
+LEAST_STEP = wp.constant(1.0e-6)  # of the distance from the camera: smaller steps are lost in float32
 STEP_CELLS = wp.constant(0.5)  # between two samples of the field along a ray
 BLOCK_CELLS = wp.constant(4)  # side of a block whose minimum is known
 INSET_PIXELS = wp.constant(1.0)  # least distance to the silhouette's edge, whose pixels mix with the background
@@ -81,7 +82,7 @@ def residual_kernel(
         size = wp.vec3(float(sdf.shape[0] - 1), float(sdf.shape[1] - 1), float(sdf.shape[2] - 1))
         scale = size * (0.5 / radius)  # cells per unit length
         span = cube_range(origin, direction, radius, 0.0, 3.0e38)
-        step = wp.max(STEP_CELLS / wp.max(wp.max(scale[0], scale[1]), scale[2]), 1.0e-6 * span[1])  # of float32
+        step = wp.max(STEP_CELLS / wp.max(wp.max(scale[0], scale[1]), scale[2]), LEAST_STEP * span[1])
         t = span[0]
         least = wp.float32(field_max)
         while t < span[1] and least > -depth:

@@ -130,7 +130,7 @@ def test_smaller_textures_are_averages(tmp_path):
 
 
 def test_textures_are_transferred_within_a_fraction_of_the_size():
-    """Two small squares, the upper one black, 0.1 of the half side apart: the lower one keeps its color."""
+    """Two small squares, the upper one black, at 0.1 of the half side: the lower one keeps its color."""
     scale = 0.05
     square = trimesh.Trimesh([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], [[0, 2, 1], [0, 3, 2]], process=False)
     upper = square.copy().apply_translation([0, 0.1, 0])
