@@ -6,6 +6,7 @@ writes the result.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -563,6 +564,7 @@ def reconstruct_folder(
         drawn, measures = sheet(), measured()
     info = {
         "object": name,
+        "folder": os.path.realpath(folder),
         "views": list(views.names),
         "views_in_folder": views.in_folder,
         "notes": [*views.notes, *watch.notes],

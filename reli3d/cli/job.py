@@ -62,7 +62,7 @@ class FolderJob:
         """Reconstructs one object and writes its files; with --skip-existing only if they are missing."""
         interrupt_flag.clear()
         with claimed(target, results.OURS) as replacing:
-            if self.skip and results.complete(target, refined=bool(self.reading.budget)):
+            if self.skip and results.complete(target, folder, refined=bool(self.reading.budget)):
                 return "skipped"
             with Bar(name) as bar:
                 reconstruct_folder(

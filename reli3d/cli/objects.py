@@ -30,7 +30,7 @@ from tqdm import tqdm
 from reli3d.cli.exit_codes import Stopped, log_of, reason, report, signals, write_log
 from reli3d.errors import InputError, printable
 from reli3d.io.files import read_bytes, write_bytes
-from reli3d.views.missing_cameras import VIDEOS
+from reli3d.views.missing_cameras import PHOTOGRAPHS, VIDEOS
 
 MAX_LIST = 1 << 28  # bytes of a list of folders: a million names of 250 letters
 SUMMARY = "summary.csv"
@@ -137,7 +137,7 @@ def items_of(paths: Sequence[Path], output: Path) -> list[Item]:
     """
     folders: list[Path] = []
     for path in paths:
-        is_list = path.is_file() and path.suffix.lower() not in VIDEOS
+        is_list = path.is_file() and path.suffix.lower() not in (*VIDEOS, *PHOTOGRAPHS)
         folders += listed(path) if is_list else [path]
     taken = {SUMMARY}
     last: dict[str, int] = {}
@@ -159,7 +159,8 @@ def listed(path: Path) -> list[Path]:
     try:
         lines = re.split(r"[\r\n]+", read_bytes(path, MAX_LIST).decode("utf-8-sig"))  # names may have other separators
     except UnicodeDecodeError as error:
-        raise InputError(path, f"expected UTF-8 text, got other bytes at {error.start}; save it as UTF-8") from None
+        problem = f"expected a folder or UTF-8 text that lists folders, got other bytes at {error.start}"
+        raise InputError(path, f"{problem}; give a folder with cameras and images") from None
     folders = [Path(line.strip()) for line in lines if line.strip()]
     if not folders:
         raise InputError(path, "expected a folder on each line, got none; name the objects")

@@ -1,6 +1,7 @@
 """Writes the files of one reconstruction atomically, by :mod:`reli3d.output.folder`."""
 
 import json
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 import reli3d
-from reli3d.errors import printable
+from reli3d.errors import InputError, printable, shown
 from reli3d.geometry.camera import camera_rays
 from reli3d.geometry.mesh import Mesh, report
 from reli3d.geometry.rays import RayScene
@@ -32,9 +33,18 @@ SILHOUETTE_PIXELS = 256  # along a side of the masks of :func:`mask_iou`
 OURS = (*FILES, COMPARISON, "illumination.hdr")  # removed from the folder of an older result
 
 
-def complete(folder: Path, *, refined: bool = False) -> bool:
-    """Whether ``folder`` holds every file of a reconstruction."""
-    return all((folder / name).is_file() for name in (*FILES, *([COMPARISON] if refined else [])))
+def complete(folder: Path, source: Path, *, refined: bool = False) -> bool:
+    """Whether ``folder`` holds every file of a reconstruction.  Raises InputError for one of another ``source``."""
+    if not all((folder / name).is_file() for name in (*FILES, *([COMPARISON] if refined else []))):
+        return False
+    try:
+        other = json.loads((folder / "run_info.json").read_bytes()).get("folder")
+    except (ValueError, AttributeError):  # changed by others
+        return False
+    if other not in (None, os.path.realpath(source)):
+        problem = f"expected the result of {shown(os.path.realpath(source))}, got that of {shown(other)}"
+        raise InputError(folder, f"{problem}; give another --output, or leave out --skip-existing")
+    return True
 
 
 def measure(mesh: Mesh, scene: RayScene, views: Views) -> Callable[[], dict]:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from reli3d._bridge import full_precision, present
 from reli3d.errors import InputError, printable, shown
-from reli3d.io.images import ASPECT, CONVERTED, above, color_of, decode_image, unit
+from reli3d.io.images import ASPECT, above, color_of, decode_image, unit
 from reli3d.views.array_cameras import NEUS, read_llff, read_neus
 from reli3d.views.background import Remover
 from reli3d.views.choose import DUPLICATE_DISTANCE_RAD, choose_views, spread_notes
@@ -73,7 +73,10 @@ def load_views(
         raise InputError(masks, "masks: expected a folder of mask images, got none; check the path")
     frames, notes = _read_cameras(root)
     index = FolderIndex()
-    frames = [replace(f, image=_existing(root, f.image, index) or f.image) for f in frames]
+    frames = [
+        replace(f, **{k: _existing(root, p, index) or p for k in ("image", "mask") if (p := getattr(f, k))})
+        for f in frames
+    ]
     _check_poses(frames)
     files = MaskFiles(root, frames, None if masks is None else Path(masks))
     offered, names = len(frames), [frame.name for frame in frames]
@@ -95,11 +98,9 @@ def load_views(
             break
         usable = others if len(others) >= LEAST_WHOLE else list(range(len(frames)))
     frames, loaded = [frames[i] for i in kept], [read[i] for i in kept]
-    notes += choice + [note for frame in frames for note in frame.notes] + _cut_off(names, cut_off, usable)
-    of_images = [note for *_, found, _ in loaded for note in found]
-    converted = [note for note in of_images if note.endswith(CONVERTED)]
-    notes += [note for note in of_images if not note.endswith(CONVERTED)]
-    notes += [f"{converted[0]}; {len(converted)} of {len(loaded)} such images"] if converted else []
+    notes += choice + _grouped([(f, note) for f in frames for note in f.notes], len(frames))
+    notes += _cut_off(names, cut_off, usable)
+    notes += _grouped([(f, note) for f, (*_, found, _) in zip(frames, loaded) for note in found], len(frames))
     check_one_label(root, notes)
     if reduced := sum(smaller for *_, smaller in loaded):
         part = f"scaled down to {MAX_FULL_PIXELS} pixels"
@@ -123,6 +124,16 @@ def load_views(
         lighting=frames[0].lighting,
         object_box=box and tuple(tuple(a - b for a, b in zip(corner, origin)) for corner in box),
     )
+
+
+def _grouped(notes: list[tuple[Frame, str]], total: int) -> list[str]:
+    """One of those notes that differ only in the frame, with their number."""
+    groups: dict[str, list[str]] = {}
+    for frame, note in notes:
+        text = note.removeprefix(frame.where)
+        text = text.partition(": ")[2] if text.startswith(frame.image.stem) else text
+        groups.setdefault(text, []).append(note)
+    return [g[0] if len(g) == 1 else f"{g[0]}; {len(g)} of {total} such images" for g in groups.values()]
 
 
 def _read_cameras(root: Path) -> tuple[list[Frame], list[str]]:
@@ -267,7 +278,8 @@ def _mask(
         if not os.path.exists(found):
             raise InputError(
                 frame.where,
-                f"mask_path: expected an image, got {shown(found.name)} which does not exist; correct the path",
+                f"mask_path: expected an image, got {shown(os.path.relpath(found, root))}, which does not exist; "
+                "correct the path",
             )
         if files.given is None:
             _still_inside(root, found, frame, "mask")
@@ -332,8 +344,6 @@ def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[s
         across, upright = present("lens.fov", lens.fov)
         fx = 0.5 * width / math.tan(0.5 * across)
         fy = fx if math.isnan(upright) else 0.5 * height / math.tan(0.5 * upright)
-    note = check_distortion(where, lens, fx, width, height)
-    notes.extend([note] if note else [])
     given = (math.nan, math.nan) if lens.center is None else lens.center
     cx = 0.5 * width if math.isnan(given[0]) else given[0] * sx
     cy = 0.5 * height if math.isnan(given[1]) else given[1] * sy
@@ -357,4 +367,6 @@ def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[s
             f"focal length: expected 0.05 to 1000 image sides, got {fx:.6g} pixels for {width}; "
             "give pixels (or radians for an angle)",
         )
+    note = check_distortion(where, lens, fx, (max(cx, width - cx), max(cy, height - cy)))
+    notes.extend([note] if note else [])
     return [fx, fy, cx, cy]

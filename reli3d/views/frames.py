@@ -155,12 +155,15 @@ def file_within(root: Path, where: str, field: str, value: object) -> Path:
     return path
 
 
-def check_distortion(where: str, lens: Lens, focal: float, width: int, height: int) -> str | None:
-    """A note if ``lens`` has distortion of at most MAX_DISTORTION_PIXELS.  Raises InputError for larger distortion."""
+def check_distortion(where: str, lens: Lens, focal: float, reach: tuple[float, float]) -> str | None:
+    """A note if ``lens`` has distortion of at most MAX_DISTORTION_PIXELS.  Raises InputError for larger distortion.
+
+    reach: largest distance of pixels from the principal point, in x and y.
+    """
     if not any(lens.radial + lens.tangential):
         return None
     try:
-        moved = distortion_pixels(focal, width, height, lens.radial, lens.tangential)
+        moved = distortion_pixels(focal, reach, lens.radial, lens.tangential)
     except OverflowError:  # a focal length next to nothing
         moved = math.inf
     if not moved <= MAX_DISTORTION_PIXELS:
@@ -173,17 +176,17 @@ def check_distortion(where: str, lens: Lens, focal: float, width: int, height: i
 
 
 def distortion_pixels(
-    focal: float, width: int, height: int, radial: tuple[float, ...], tangential: tuple[float, ...]
+    focal: float, reach: tuple[float, float], radial: tuple[float, ...], tangential: tuple[float, ...]
 ) -> float:
     """Largest displacement [px] by a polynomial lens: radial k1, k2, ..., tangential p1, p2 (OpenCV).
 
-    Evaluated along the diagonal, as coefficients of opposite sign cancel at the corner and not before it.
+    Evaluated from the principal point to ``reach`` [px], as coefficients of opposite sign cancel at the corner and not
+    before it.
     """
-    corner = 0.5 * width / focal, 0.5 * height / focal
     p1, p2 = tangential or (0.0, 0.0)
     largest = 0.0
     for step in range(1, RADII + 1):
-        x, y = (v * step / RADII for v in corner)
+        x, y = (v / focal * step / RADII for v in reach)
         r2 = x * x + y * y
         factor = abs(sum(k * r2 ** (i + 1) for i, k in enumerate(radial)))
         dx = x * factor + abs(2 * p1 * x * y) + abs(p2 * (r2 + 2 * x * x))

@@ -13,6 +13,7 @@ The field of view is 0.7 radians, as in the ReLi3D release, if neither the frame
 Unsupported keys that resemble lens keys, and lenses other than a pinhole, are errors.
 """
 
+import itertools
 import math
 import re
 from collections.abc import Iterator
@@ -41,7 +42,7 @@ _FOCALS = (("fl_x", "fl_y"), ("fx", "fy"))
 _ANGLES = (("x_fov", "y_fov", math.pi / 180), ("camera_angle_x", "camera_angle_y", 1.0))
 _FOVS = ("camera_fov", "fov_rad")
 _SIDES = (("w", "width", "image_width"), ("h", "height", "image_height"))
-_SIZES = ("resolution", "img_wh", "image_size", "img_size")  # width and height in a list
+_SIZES = ("resolution", "img_wh", "image_size", "img_size")  # width and height in a list, of the last two one number
 _RADIAL, _TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
 _READ = {
     *_MATRICES,
@@ -66,22 +67,31 @@ _LENS = re.compile(
     r"|(camera|cam)(param(eter)?s?|info|data)?|(cam|view)?angle[xy]|fl[xy]?|f[xy]?|c[xy]|k|kmatrix|camk|hwf|lens"
     r"|p|(camera|cam)?proj(ection)?(mat(rix)?)?"
 )
+_NO_LENS = re.compile(
+    r"(is)?undistorted|distortioncorrected|(camera|cam|sensor|lens|calib(ration)?|intrinsics?)(id|idx|index)"
+)
 _COEFFICIENTS = ("d", "dist", "coeffs", "coefficients")  # where these are lists
-_AXES = re.compile(r"(coordinate|coord|axis|axes|pose|camera)*(system|convention|coordinates?|axes)")
+_AXES = re.compile(r"(coordinate|coord|axis|axes|pose|camera)*(system|convention|coordinates?|axes)|pose(type|format)")
 _OPENCV = re.compile(r".*(opencv|colmap|rdf).*|cv")
+_OTHER_AXES = re.compile(r".*(pytorch3d|p3d|unity|unreal|mitsuba|directx|left.?hand|w2c|world.?(to|2).?cam).*")
+_FLIPPED = {"from_na": "second and third", "from_mitsuba": "first and third"}  # columns, of forks of instant-ngp
 
 
 def check_keys(where: str, values: dict) -> None:
     """Raises InputError for an unsupported key that changes the camera.  Null, false and 0 change nothing."""
     for key, value in values.items():
         word = _word(key)
-        if isinstance(value, str) and _AXES.fullmatch(word) and _OPENCV.fullmatch(value.lower().strip()):
-            raise InputError(
-                where,
-                f"{key}: expected camera-to-world matrices in OpenGL axes, got {shown(value)}; negate the second and "
-                "third column of each matrix and remove the key",
-            )
-        if key in _READ or _nothing(value):
+        columns = None if _nothing(value) else _FLIPPED.get(key)
+        other = False
+        if isinstance(value, str) and _AXES.fullmatch(word):
+            columns = "second and third" if _OPENCV.fullmatch(value.lower().strip()) else None
+            other = bool(_OTHER_AXES.fullmatch(value.lower().strip()))
+        if columns or other:
+            fix = f"negate the {columns} column of each matrix" if columns else "convert the matrices"
+            problem = f"{key}: expected camera-to-world matrices in OpenGL axes, got {shown(value)}"
+            raise InputError(where, f"{problem}; {fix} and remove the key")
+        number_of_camera = word in ("camera", "cam") and isinstance(value, int)
+        if key in _READ or _nothing(value) or _NO_LENS.fullmatch(word) or number_of_camera:
             continue
         if _MODEL.fullmatch(word) and isinstance(value, str):
             if re.sub(r"[^A-Z0-9]+", "_", value.upper().strip()) not in _PINHOLE:
@@ -154,28 +164,25 @@ def _words(value: object) -> bool:
 def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
     """The lens of ``frame`` in a file with the fields ``data``; both have passed :func:`check_keys`.
 
-    Raises InputError naming the field if the values are not a lens or if two keys disagree.
+    A null is no value.  Raises InputError naming the field if the values are not a lens or if two keys disagree.
     """
+    frame, data = ({k: v for k, v in source.items() if v is not None} for source in (frame, data))
 
     def found(key: str, low: float = -1e6, high: float = 1e6) -> float | None:
         value = frame.get(key, data.get(key))
         return None if value is None else number(where, key, value, low, high)
 
-    size, center = _size(where, frame, data, found), _center(where, frame, data, found)
+    size, center = _size(where, frame, data), _center(where, frame, data, found)
     lens = None
     for source in (frame, data):
         spellings = list(_spellings(where, source, data, size))
         if spellings:
-            name, lens, ratio = spellings[0]
-            for other, _, value in spellings[1:]:
-                if abs(ratio - value) > AGREE * ratio:  # False where one is not known, NaN
-                    raise InputError(
-                        where,
-                        f"{other}: expected the focal length of {name}, {ratio:.4g} image widths, got {value:.4g}; "
-                        "remove the wrong one",
-                    )
-            if lens.center is None:
-                lens = replace(lens, center=center)
+            name, lens, first = spellings[0]
+            for (other, _, second), k in itertools.product(spellings[1:], (0, 1)):
+                if abs(first[k] - second[k]) > AGREE * first[k]:  # False where one is not known, NaN
+                    expected = f"{other}: expected the focal length of {name}, {first[k]:.4g} image {_SIDES[k][1]}s"
+                    raise InputError(where, f"{expected}, got {second[k]:.4g}; remove the wrong one")
+            lens = replace(lens, center=center)
             if name not in _FOVS or lens.center is not None:
                 lens = replace(lens, size=size)
             break
@@ -191,70 +198,85 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
     return replace(lens, radial=radial, tangential=tangential)
 
 
-def _spellings(where: str, source: dict, data: dict, size) -> Iterator[tuple[str, Lens, float]]:
-    """``(key, lens, focal length in image widths or NaN)`` of each spelling in ``source``, in order of preference."""
-    width = math.nan if size is None else size[0]
+def _spellings(where: str, source: dict, data: dict, size) -> Iterator[tuple[str, Lens, tuple[float, float]]]:
+    """``(key, lens, focal lengths)`` of each spelling in ``source``, in order of preference.
+
+    Focal lengths are in image widths and heights, NaN where one is not known.
+    """
+    width, height = (math.nan, math.nan) if size is None else size
     for key in _MATRICES:
-        if source.get(key) is not None:
+        if key in source:
             fx, fy, cx, cy = _matrix(where, key, source[key])
-            yield key, Lens(focal=(fx, fy), center=(cx, cy)), fx / width
+            yield key, Lens(focal=(fx, fy), center=(cx, cy)), (fx / width, fy / height)
     for x_key, y_key in _FOCALS:
-        if source.get(x_key) is not None or source.get(y_key) is not None:
-            fx = number(where, x_key, source.get(x_key, data.get(x_key)), 0, 1e9)
-            y = _upright(source, data, x_key, y_key)
-            fy = fx if y is None else number(where, y_key, y, 0, 1e9)
-            yield x_key, Lens(focal=(fx, fy)), fx / width
+        if x_key in source or y_key in source:
+            fx, fy = _both(where, source, data, (x_key, y_key), (0, 1e9))
+            yield x_key, Lens(focal=(fx, fx if math.isnan(fy) else fy)), (fx / width, fy / height)
     for x_key, y_key, unit in _ANGLES:
-        if source.get(x_key) is not None or source.get(y_key) is not None:
-            low, high = MIN_FOV / unit, math.pi / unit
-            x = unit * number(where, x_key, source.get(x_key, data.get(x_key)), low, high)
-            upright = _upright(source, data, x_key, y_key)
-            y = math.nan if upright is None else unit * number(where, y_key, upright, low, high)
-            yield x_key, Lens(fov=(x, y)), _widths(x)
+        if x_key in source or y_key in source:
+            x, y = (unit * v for v in _both(where, source, data, (x_key, y_key), (MIN_FOV / unit, math.pi / unit)))
+            yield x_key, Lens(fov=(x, y)), (_widths(x), _widths(y))
     for key in _FOVS:
-        if source.get(key) is not None:
+        if key in source:
             fov = _fov(where, key, source[key])
-            yield key, Lens(fov=fov), _widths(fov[0])
-    if source.get("focal_length") is not None:
+            yield key, Lens(fov=fov), (_widths(fov[0]), math.nan)  # some write the field across twice
+    if "focal_length" in source:
         sensor = source.get("sensor_width", data.get("sensor_width"))
         if sensor is None:
             got = f"{shown(source['focal_length'])} of an unknown unit"
             raise InputError(where, f"focal_length: expected sensor_width with it, got {got}; write fl_x in pixels")
         focal = number(where, "focal_length", source["focal_length"], 0, 1e9)
         ratio = focal / number(where, "sensor_width", sensor, 0, 1e9)
-        yield "focal_length", Lens(fov=(2 * math.atan(0.5 / ratio), math.nan)), ratio
+        yield "focal_length", Lens(fov=(2 * math.atan(0.5 / ratio), math.nan)), (ratio, math.nan)
 
 
-def _upright(source: dict, data: dict, x_key: str, y_key: str) -> object:
-    """The value of ``y_key``; that of the file for a frame only where the file has none across as well."""
-    return source.get(y_key, None if data.get(x_key) is not None else data.get(y_key))
+def _both(where: str, source: dict, data: dict, keys: tuple[str, str], limits: tuple[float, float]) -> list[float]:
+    """The values of two keys, across and upright, NaN for none upright.
+
+    The file's value upright counts for a frame only where the file has none across as well.
+    """
+    across, upright = keys
+    x = source.get(across, data.get(across))
+    y = source.get(upright, None if across in data else data.get(upright))
+    if x is None:
+        raise InputError(where, f"{across}: expected it with {upright}, got {upright} alone; add {across}")
+    return [number(where, across, x, *limits), math.nan if y is None else number(where, upright, y, *limits)]
 
 
 def _widths(fov: float) -> float:
     return 0.5 / math.tan(0.5 * fov)
 
 
-def _size(where: str, frame: dict, data: dict, found) -> tuple[int, int] | None:
-    sides = [next((v for v in (found(key, 0) for key in keys) if v is not None), None) for keys in _SIDES]
-    w, h = sides
-    if any(side is not None and side < 1 for side in sides):
+def _size(where: str, frame: dict, data: dict) -> tuple[int, int] | None:
+    def side(axis: int) -> float | None:
+        for source in (frame, data):
+            for key in _SIDES[axis]:
+                if key in source:
+                    return number(where, key, source[key], 0, 1e6)
+            for key in _SIZES:
+                pair = source.get(key)
+                if isinstance(pair, int | float) and key in _SIZES[2:]:
+                    pair = [pair, pair]
+                if isinstance(pair, list) and len(pair) == 2:
+                    return number(where, key, pair[axis], 0, 1e6)
+        return None
+
+    w, h = side(0), side(1)
+    if any(side is not None and side < 1 for side in (w, h)):
         raise InputError(where, f"w, h: expected at least 1 pixel, got {w} x {h}; correct the camera file")
     if (w is None) != (h is None):
         raise InputError(where, f"w, h: expected both or none, got {w} x {h}; write the size of the images")
-    if w is None or h is None:
-        pairs = (source[key] for source in (frame, data) for key in _SIZES if key in source)
-        pair = next((p for p in pairs if isinstance(p, list) and len(p) == 2), None)
-        if pair is None:
-            return None
-        w, h = (number(where, "image size", side, 1, 1e6) for side in pair)
-    return int(w), int(h)
+    return None if w is None or h is None else (int(w), int(h))
 
 
 def _center(where: str, frame: dict, data: dict, found) -> tuple[float, float] | None:
     for source in (frame, data):
-        if source.get("camera_principal_point") is not None:
+        for key in _MATRICES:
+            if key in source:
+                return _matrix(where, key, source[key])[2:]
+        if "camera_principal_point" in source:
             return _pair(where, "camera_principal_point", source["camera_principal_point"], -1e6, 1e6)
-        if source.get("cx") is not None or source.get("cy") is not None:
+        if "cx" in source or "cy" in source:
             cx, cy = found("cx"), found("cy")
             return (math.nan if cx is None else cx, math.nan if cy is None else cy)
     return None

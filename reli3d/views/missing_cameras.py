@@ -16,11 +16,13 @@ CAMERA_FILES = ("transforms.json", "transforms_train.json", "sparse", "poses_bou
 def no_cameras(source: Path) -> InputError:
     """The error for ``source``, which is not a folder with cameras.
 
-    Names the exact ``reli3d capture`` command if ``source`` is a video, or has photographs in it, in ``images`` or in a
-    sub-folder.
+    Names the exact ``reli3d capture`` command if ``source`` is a video or a photograph, or has photographs in it, in
+    ``images`` or in a sub-folder.
     """
     if source.suffix.lower() in VIDEOS and source.is_file():
         return _capture(source, source, "a video")
+    if source.suffix.lower() in PHOTOGRAPHS and source.is_file():
+        return _capture(source, source.absolute().parent, "a photograph", source.parent)
     try:
         folders = sorted(p for p in source.iterdir() if p.is_dir())
     except (OSError, ValueError):

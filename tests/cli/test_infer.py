@@ -105,13 +105,18 @@ def test_a_hostile_folder_ends_with_2_one_line_and_no_file(tmp_path, capsys, nam
 def test_one_bad_object_leaves_the_others_bitwise_equal(example, tmp_path, capsys):
     (tmp_path / "bad").mkdir()
     assert command(tmp_path, tmp_path / "bad", infer.EXAMPLE) == 1
-    assert results.complete(tmp_path / "out" / "example")
+    assert results.complete(tmp_path / "out" / "example", infer.EXAMPLE)
     assert capsys.readouterr().out.strip().endswith("mesh.glb")
     for name in ("mesh.glb", "environment.exr", "preview.png"):
         assert (tmp_path / "out/example" / name).read_bytes() == (example / name).read_bytes()
     before = (tmp_path / "out/example/mesh.glb").stat().st_mtime_ns
     assert command(tmp_path, infer.EXAMPLE, "--skip-existing") == 0
     assert (tmp_path / "out/example/mesh.glb").stat().st_mtime_ns == before
+    namesake = tmp_path / "other" / "example"
+    namesake.mkdir(parents=True)
+    capsys.readouterr()
+    assert command(tmp_path, namesake, "--skip-existing") == 2
+    assert f"got that of '{infer.EXAMPLE}'; give another --output" in capsys.readouterr().err
 
 
 def test_check_explains_the_example_and_draws_the_rig(tmp_path, capsys):

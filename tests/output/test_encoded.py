@@ -47,7 +47,7 @@ def test_the_mesh_is_moved_and_the_page_shows_it_in_place(tmp_path, asset, views
     assert (tmp_path / "ball" / "mesh.glb").read_bytes() == glb_bytes(asset, extras=extras, translation=MOVED)
     (shown,) = re.findall(r'"glb": "([^"]*)"', (tmp_path / "ball" / "viewer.html").read_text())
     assert base64.b64decode(shown) == glb_bytes(asset, extras=extras)
-    assert results.complete(tmp_path / "ball")
+    assert results.complete(tmp_path / "ball", tmp_path)
 
 
 def test_the_page_of_a_refined_result_has_both(tmp_path, asset, views):

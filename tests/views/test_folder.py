@@ -131,7 +131,7 @@ def test_small_distortion_is_ignored_with_a_note_and_large_refused(tmp_path):
     with pytest.raises(InputError, match="undistort"):
         load_views(tmp_path)
     # k1 moves the corner at radius r (over the focal length) by f k1 r^3
-    assert distortion_pixels(100, 120, 160, (0.1, 0.0), ()) == pytest.approx(100 * 0.1 * 1.0**3)
+    assert distortion_pixels(100, (60.0, 80.0), (0.1, 0.0), ()) == pytest.approx(100 * 0.1 * 1.0**3)
 
 
 def test_which_mask_counts(tmp_path):

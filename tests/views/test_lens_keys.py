@@ -44,6 +44,7 @@ READ = {
     "width and height": ({"fl_x": 2 * F, "cx": 2 * CX, "cy": 2 * CY, "width": 2 * S, "height": 2 * S}, [F, F, CX, CY]),
     "resolution": ({"fl_x": 2 * F, "resolution": [2 * S, 2 * S]}, MIDDLE),
     "img_wh": ({"fl_x": 2 * F, "img_wh": [2 * S, 2 * S]}, MIDDLE),
+    "image_size, one number": ({"fl_x": 2 * F, "image_size": 2 * S}, MIDDLE),
     "two that agree": ({"fl_x": F, "camera_angle_x": FOV, "w": S, "h": S}, MIDDLE),
 }
 
@@ -89,6 +90,10 @@ HARMLESS = {
     "camera_convention": "opengl",
     "scale": 0.33,
     "depth_file_path": "none",
+    "undistorted": True,
+    "camera": 2,
+    "sensor_id": 3,
+    "pose_type": "c2w",
 }
 
 
@@ -170,6 +175,12 @@ REFUSED = [
     {"dist": [-0.3, 0.1, 0, 0], "fl_x": F},
     {"coordinate_system": "opencv"},
     {"camera_convention": "COLMAP"},
+    {"camera_convention": "pytorch3d"},
+    {"coordinate_system": "unity"},
+    {"pose_type": "w2c"},
+    {"from_na": True},
+    {"from_mitsuba": True},
+    {"fl_x": F, "fl_y": F, "camera_angle_y": 1.2, "camera_angle_x": FOV, "w": S, "h": S},
 ]
 
 
@@ -188,6 +199,32 @@ def test_distortion_that_cancels_at_the_corner_is_refused(tmp_path):
     r2 = 2 * (0.5 * S / F) ** 2
     with pytest.raises(InputError, match="distortion: expected an undistorted lens"):
         load(tmp_path, fl_x=F, k1=3.0, k2=-3.0 / r2)  # 3 r^3 - 3 r^5 / r2 is 0 at the corner
+
+
+FRAME_FIRST = [  # keys of a frame, keys of the file, pixels
+    ({"w": None, "h": None}, {"fl_x": 2 * F, "w": 2 * S, "h": 2 * S}, MIDDLE),
+    ({"cx": None, "cy": None}, {"fl_x": F, "cx": CX, "cy": CY}, [F, F, CX, CY]),
+    ({"width": S, "height": S}, {"fl_x": F, "w": 2 * S, "h": 2 * S}, MIDDLE),
+    ({"fl_x": 2 * F}, {"intrinsics": K}, [2 * F, 2 * F, CX, CY]),
+    ({"cx": 14.0, "cy": 13.0}, {"intrinsics": K}, [F, F, 14.0, 13.0]),
+]
+
+
+@pytest.mark.parametrize("frame, file, expected", FRAME_FIRST)
+def test_each_value_is_the_frames_and_null_is_none(tmp_path, frame, file, expected):
+    np.testing.assert_allclose(load(tmp_path, frame, **file).intrinsics, [expected] * 3, rtol=1e-6)
+
+
+def test_null_in_a_frame_leaves_the_files_distortion(tmp_path):
+    with pytest.raises(InputError, match="distortion: expected an undistorted lens"):
+        load(tmp_path, {"k1": None}, fl_x=F, k1=0.5)
+
+
+def test_distortion_counts_from_the_principal_point(tmp_path):
+    k1 = 1.5 * 0.5 / F / (0.5 * 2**0.5 * S / F) ** 3  # of 0.75 pixels at the corners of a centered lens
+    load(tmp_path / "a", fl_x=F, k1=0.5 * k1)
+    with pytest.raises(InputError, match="distortion: expected an undistorted lens"):
+        load(tmp_path / "b", fl_x=F, k1=0.5 * k1, cx=4.0, cy=4.0)
 
 
 def test_a_byte_order_mark_is_read_over(tmp_path):
