@@ -26,7 +26,7 @@ from reli3d.synthetic.noise import fbm
 from reli3d.synthetic.samples import Surface, random_faces
 
 UNCHANGED_PROBABILITY = 0.4  # of an object without other materials; its base color may still be multiplied
-RECOLORED_PROBABILITY = 0.6  # of an object whose base color is multiplied by a random color
+RECOLORED_PROBABILITY = 0.3  # of an object whose base color is multiplied by a random color
 GAIN_DEVIATION, HUE_DEVIATION = 0.3, 0.12  # standard deviations of its logarithm: of all channels, of each channel
 REGION_COUNTS = (0.3, 0.35, 0.2, 0.15)  # probability of 1, 2, 3, 4 regions
 MAX_ALBEDO = 0.95  # of a base color that was multiplied, unless it was larger
@@ -87,6 +87,7 @@ class RefinishedSurface:
 
     def __init__(self, base: Surface, sets: Sequence[Path], rng: np.random.Generator, *, measured: bool, texels: int):
         self.base, self.vertices, self.faces, self.scene = base, base.vertices, base.faces, base.scene
+        self.outer = base.outer
         kept = rng.random() < UNCHANGED_PROBABILITY
         count = 1 if kept else 1 + int(rng.choice(len(REGION_COUNTS), p=REGION_COUNTS))
         self._region = _draw_region(base, rng, count) if count > 1 else None

@@ -5,6 +5,7 @@ with shapes and units.  It has ``V`` views of ``S`` by ``S`` pixels, cropped to 
 centered, longest side 1.  Radiance is scaled by the exposure of the first view.
 """
 
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -28,6 +29,8 @@ SAMPLES = (4, 3, 1)  # light, GGX and cosine samples per ray; with FINE**2 rays 
 FINE = 2  # rays along each side of a pixel
 DIFFUSE_MODEL = "published"  # the training data of the bundled weights, and the formula of glTF viewers
 EXPOSURE_TARGET = 0.6  # linear value of the 90th percentile of the object in the first view
+SKY_DIRECTIONS = 48  # tested rays to the outside: they find an opening of a tenth of the sphere
+OFF_SURFACE = 1e-3  # distance of the points from which a face is tested
 VOLUME_POINTS, SURFACE_POINTS, PIXELS = 16384, 8192, 1024
 
 
@@ -43,12 +46,41 @@ def crop_camera(vertices: Tensor, c2w: Tensor, size: int, padding: float) -> Ten
     return torch.stack([focal, focal, center[0], center[1]])
 
 
+def enclosed(points: Tensor, scene: RayScene) -> Tensor:
+    """Whether all of SKY_DIRECTIONS rays from each of ``points (N, 3)`` hit ``scene``, ``(N,)`` bool.
+
+    Ray parity and winding numbers are unreliable for meshes with holes and internal faces.
+    """
+    z = 1 - (2 * torch.arange(SKY_DIRECTIONS) + 1) / SKY_DIRECTIONS
+    phi = torch.arange(SKY_DIRECTIONS) * (np.pi * (3 - 5**0.5))
+    radius = (1 - z * z).sqrt()
+    sphere = torch.stack([radius * phi.cos(), z, radius * phi.sin()], -1).float()
+    hidden = torch.ones(len(points), dtype=torch.bool)
+    for direction in sphere:
+        index = hidden.nonzero()[:, 0]
+        hidden[index] = scene.occluded(points[index], direction.expand(len(index), 3).contiguous())
+    return hidden
+
+
+def outer_faces(vertices: Tensor, faces: Tensor, scene: RayScene) -> Tensor:
+    """Faces ``(F,)`` bool of which a point, on either side, is not :func:`enclosed`; all if every one is."""
+    corners = vertices[faces.long()]
+    across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    offset = OFF_SURFACE * functional.normalize(across, dim=-1)[:, None]
+    points = 0.6 * corners + 0.4 * corners.mean(1, keepdim=True)  # between each corner and the center
+    points = torch.cat([points, corners.mean(1, keepdim=True)], 1)
+    sides = torch.cat([points + offset, points - offset], 1)
+    outer = ~enclosed(sides.reshape(-1, 3), scene).view(len(faces), -1).all(1)
+    return outer if bool(outer.any()) else ~outer
+
+
 class Surface(Protocol):
     """Interface of an object: its mesh, and geometry and material at ray hits."""
 
     vertices: Tensor  # (V, 3)
     faces: Tensor  # (F, 3) int32
     scene: RayScene
+    outer: Tensor  # (F,) bool, faces outside the solid, see outer_faces
 
     def distance(self, points: Tensor) -> Tensor:
         """Signed distance ``(N,)`` of points ``(N, 3)``, positive outside."""
@@ -67,6 +99,7 @@ class ObjectSurface:
         self.corner_normals = torch.as_tensor(shape.normals)
         self.part = torch.as_tensor(shape.part)
         self.scene = RayScene(self.vertices, self.faces)
+        self.outer = outer_faces(self.vertices, self.faces, self.scene)
 
     def distance(self, points: Tensor) -> Tensor:
         return signed_distance(self.vertices, self.faces, points)
@@ -89,13 +122,19 @@ def _render(surface: Surface, camera: Camera, light: Environment, seed: int):
     origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
     hits = surface.scene.closest(origins, directions)
     seen = (hits.face >= 0).nonzero()[:, 0]
-    points = surface.points_at(hits.face[seen].long(), hits.bary[seen])
-    wo = -directions[seen]
+    points, wo = surface.points_at(hits.face[seen].long(), hits.bary[seen]), -directions[seen]
+    points = _turned(points, (points.ng * wo).sum(-1) < 0.0)  # as shading does
     options = ShadeOptions(samples=SAMPLES, seed=seed, diffuse_model=DIFFUSE_MODEL)
     radiance = shade(points, wo, light, scene=surface.scene, options=options)
     image = light.lookup(directions)
     image[seen] = radiance
     return image, seen, points, wo, radiance
+
+
+def _turned(points: SurfacePoints, back: Tensor) -> SurfacePoints:
+    """``points`` with reversed normals where ``back (N,)``: of a surface that is seen from behind."""
+    sign = 1.0 - 2.0 * back[:, None].float()
+    return replace(points, ng=sign * points.ng, normal=sign * points.normal)
 
 
 def synthesize(
@@ -192,9 +231,10 @@ def _coverage(scene: RayScene, camera: Camera, grid: int) -> Tensor:
 
 
 def random_faces(surface: Surface, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Faces ``(N,)`` and barycentrics ``(N, 2)`` of random points, uniform by area."""
+    """Faces ``(N,)`` and barycentrics ``(N, 2)`` of random points on ``surface.outer``, uniform by area."""
     corners = surface.vertices[surface.faces.long()].numpy()
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    area = area * surface.outer.numpy()
     face = rng.choice(len(area), count, p=area / area.sum())
     u = np.sqrt(rng.random(count))
     v = rng.random(count)
@@ -214,7 +254,9 @@ def _volume(surface: Surface, rng: np.random.Generator) -> dict[str, Tensor]:
 
 def _surface_points(surface: Surface, cameras: Camera, rng: np.random.Generator) -> dict[str, Tensor]:
     points = surface.points_at(*random_faces(surface, SURFACE_POINTS, rng))
-    visible = visible_from(surface.scene, points.position, points.ng, cameras)
+    visible, behind = (visible_from(surface.scene, points.position, sign * points.ng, cameras) for sign in (1, -1))
+    back = behind.any(1) & ~visible.any(1)
+    points, visible = _turned(points, back), torch.where(back[:, None], behind, visible)
     finish = torch.stack([points.roughness, points.metallic], 1)
     encoded = torch.cat([linear_to_srgb(points.base_color.clamp(0, 1)), finish], -1)
     return {

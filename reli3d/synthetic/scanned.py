@@ -15,8 +15,8 @@ from reli3d.geometry.rays import RayScene
 from reli3d.io.glb import read_glb
 from reli3d.render.gbuffer import surface_points
 from reli3d.render.points import SurfacePoints
+from reli3d.synthetic.samples import Surface, enclosed, outer_faces
 
-SKY_DIRECTIONS = 48  # tested rays to the outside: they find an opening of a tenth of the sphere
 STRETCH_SIGMA = 0.18  # standard deviation of the logarithm of the scale along each axis
 GAIN = 0.2  # standard deviation of the logarithm of the factor of the base color
 
@@ -26,21 +26,10 @@ def _read(path: Path):
     return read_glb(path)
 
 
-def outside_distance(vertices: Tensor, faces: Tensor, points: Tensor, scene: RayScene) -> Tensor:
-    """Signed distance ``(N,)`` to a mesh with holes and internal faces: negative where all of SKY_DIRECTIONS rays hit.
-
-    Ray parity and winding numbers are unreliable for such meshes.
-    """
-    z = 1 - (2 * torch.arange(SKY_DIRECTIONS) + 1) / SKY_DIRECTIONS
-    phi = torch.arange(SKY_DIRECTIONS) * (np.pi * (3 - 5**0.5))
-    radius = (1 - z * z).sqrt()
-    sphere = torch.stack([radius * phi.cos(), z, radius * phi.sin()], -1).float()
-    hidden = torch.ones(len(points), dtype=torch.bool)
-    for direction in sphere:
-        index = hidden.nonzero()[:, 0]
-        hidden[index] = scene.occluded(points[index], direction.expand(len(index), 3).contiguous())
-    distance = signed_distance(vertices, faces, points).abs()
-    return torch.where(hidden, -distance, distance)
+def outside_distance(surface: Surface, points: Tensor) -> Tensor:
+    """Distance ``(N,)`` to the outer faces of a mesh with holes and internal faces, negative where enclosed."""
+    distance = signed_distance(surface.vertices, surface.faces[surface.outer], points).abs()
+    return torch.where(enclosed(points, surface.scene), -distance, distance)
 
 
 class ScannedSurface:
@@ -61,9 +50,10 @@ class ScannedSurface:
         self.vertices, self.faces = whole.vertices, whole.faces
         self.starts = torch.as_tensor(np.cumsum([0] + [len(a.mesh.faces) for a in self.assets]))
         self.scene = RayScene(self.vertices, self.faces)
+        self.outer = outer_faces(self.vertices, self.faces, self.scene)
 
     def distance(self, points: Tensor) -> Tensor:
-        return outside_distance(self.vertices, self.faces, points, self.scene)
+        return outside_distance(self, points)
 
     def points_at(self, face: Tensor, bary: Tensor) -> SurfacePoints:
         vectors, numbers = torch.empty(4, len(face), 3), torch.empty(2, len(face))

@@ -26,13 +26,13 @@ MAX_FACES = 60_000
 
 
 class ShapeSurface(ObjectSurface):
-    """One or more shapes with procedural materials; distances treat open undersides as closed."""
+    """One or more shapes with procedural materials; holes are closed."""
 
     def __init__(self, paths: Sequence[Path], rng: np.random.Generator):
         super().__init__(combine([paths[int(rng.integers(len(paths)))] for _ in range(_count(rng))], rng))
 
     def distance(self, points: Tensor) -> Tensor:
-        return outside_distance(self.vertices, self.faces, points, self.scene)
+        return outside_distance(self, points)
 
 
 def _count(rng: np.random.Generator) -> int:
@@ -49,7 +49,27 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     _, first, index = np.unique(np.round(v * 1e5).astype(np.int64), axis=0, return_index=True, return_inverse=True)
     f = index.reshape(-1)[f]
     keep = (f[:, 0] != f[:, 1]) & (f[:, 1] != f[:, 2]) & (f[:, 2] != f[:, 0])
-    return v[first], f[keep], part[keep]
+    return capped(v[first], f[keep], part[keep])
+
+
+def capped(v: np.ndarray, f: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The mesh with a fan of faces over each hole: shapes often lack their bottom, but are meant to be solid."""
+    of = {(int(a), int(b)): int(p) for tri, p in zip(f, part) for a, b in zip(tri, np.roll(tri, -1))}
+    follow = {b: (a, p) for (a, b), p in of.items() if (b, a) not in of}
+    points, caps, parts = [v], [], []
+    while follow:
+        loop, at = [], next(iter(follow))
+        while at in follow:
+            loop.append((at, *follow.pop(at)))
+            at = loop[-1][1]
+        if len(loop) > 2 and at == loop[0][0]:  # not where holes touch
+            center = len(v) + len(points) - 1
+            points.append(v[[a for a, _, _ in loop]].mean(0, keepdims=True))
+            caps += [(a, b, center) for a, b, _ in loop]
+            parts += [p for _, _, p in loop]
+    if not caps:
+        return v, f, part
+    return np.concatenate(points), np.concatenate([f, np.array(caps, f.dtype)]), np.concatenate([part, parts])
 
 
 def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject:

@@ -25,6 +25,7 @@ RELIGHT_PROBABILITY = 0.6  # of samples that are rendered again under another en
 TONE_PROBABILITY, TONE_SIGMA = 0.5, 0.2  # of a random exponent of the sRGB colors; deviation of its logarithm
 MIRROR_PROBABILITY = 0.4  # of mirror images of the views of a symmetric object, as at inference
 MAX_MIRRORED = 4  # views with mirror images
+PLACEMENT_PROBABILITY, SCALE_SIGMA, SHIFT_SIGMA = 0.35, 0.18, 0.04  # deviations of log scale and of position
 UNCHANGED_PROBABILITY = 0.75  # of not mirroring, and of not permuting the color channels
 
 
@@ -142,7 +143,7 @@ def load_sample(
     valid = depth > 0
     if augment and lights is not None and rng.random() < RELIGHT_PROBABILITY:
         finish = Finish.draw(rng)
-        material, of_pixels = finish.apply(material), finish.apply(of_pixels)
+        material, of_pixels, known = finish.apply(material), finish.apply(of_pixels), torch.ones_like(known)
         other, flash = draw_light(lights, rng), draw_flash(rng)
         camera = Camera(c2w, intrinsics, *images.shape[2:0:-1])
         images, light = relight_views(images, of_pixels, normal, valid, camera, other, rng, flash)
@@ -154,7 +155,12 @@ def load_sample(
         images, of_pixels, normal, depth, valid = (t.flip(2) for t in (images, of_pixels, normal, depth, valid))
         intrinsics = intrinsics.clone()
         intrinsics[:, 2] = images.shape[2] - intrinsics[:, 2]
+    scale, shift = draw_placement(rng) if augment else (1.0, np.zeros(3))
+    moved = torch.as_tensor(shift, dtype=torch.float32, device=device)
+    volume, distance, depth = scale * volume + moved, scale * distance, scale * depth
+    surface[:, 0] = scale * surface[:, 0] + moved
     c2w = c2w.clone()
+    c2w[:, :3, 3] = scale * c2w[:, :3, 3] + moved
     c2w[:, :3] = turn @ c2w[:, :3]
     if mirrored:
         c2w[:, :, 0] *= -1  # the camera stays right-handed, its image is flipped
@@ -172,6 +178,7 @@ def load_sample(
         color = (color + float(rng.random()) * MAX_NOISE * noise).clamp(0, 1)
     mirrors = Camera(c2w[:0], intrinsics[:0], *masks.shape[:0:-1])
     if plane is not None:
+        plane = plane[0], scale * plane[1] + float(np.dot(plane[0], shift))
         axis = turn @ torch.as_tensor(plane[0], dtype=torch.float32, device=device)
         mirrors = MirrorPlane(axis, plane[1]).mirrored(Camera(c2w, intrinsics, *masks.shape[:0:-1]))
     origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # depth of the world's origin
@@ -196,6 +203,13 @@ def load_sample(
         mirrored_c2w=mirrors.c2w,
         mirrored_intrinsics=mirrors.intrinsics,
     )
+
+
+def draw_placement(rng: np.random.Generator) -> tuple[float, np.ndarray]:
+    """Random scale and shift ``(3,)``: objects are normalized by their visual hull, which is larger."""
+    if rng.random() > PLACEMENT_PROBABILITY:
+        return 1.0, np.zeros(3)
+    return float(np.exp(-abs(rng.normal(0, SCALE_SIGMA)))), rng.normal(0, SHIFT_SIGMA, 3)
 
 
 def draw_samples(

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from reli3d.nn.heads import ROUGHNESS_MIN
 from reli3d.nn.local import LocalField, LocalReconstructor, PixelMaps
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
@@ -164,7 +165,9 @@ def _finish(pixels: PixelMaps, views: TrainingViews) -> dict[str, Tensor]:
         return {}
     target, found = views.view_material[valid][:, 3:], {}
     for k, name in enumerate(("roughness", "metallic")):
-        found[f"pixel_{name}"] = excess_entropy(getattr(pixels, name)[valid][:, 0].sigmoid(), target[:, k])
+        low = ROUGHNESS_MIN if name == "roughness" else 0.0  # of the range of the network's values
+        wanted = ((target[:, k] - low) / (1.0 - low)).clamp(min=0.0)
+        found[f"pixel_{name}"] = excess_entropy(getattr(pixels, name)[valid][:, 0].sigmoid(), wanted)
     return found
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 MOMENTUM = 0.95
 UPDATE_RMS = 0.2  # root mean square of an update over the learning rate, about that of AdamW (Liu et al. 2025)
-MIN_RANK = 8  # matrices of smaller rank are left to AdamW
+MIN_RANK = 16  # matrices of smaller rank are left to AdamW
 NEWTON_SCHULZ = (3.4445, -4.7750, 2.0315)  # coefficients of Jordan's quintic iteration
 NEWTON_SCHULZ_STEPS = 5
 MAX_TIMES = 1.0  # multiplier of the learning rate above which a layer, small at first, is left to AdamW

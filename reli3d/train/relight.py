@@ -109,7 +109,8 @@ def relight_views(
     surface = images.new_zeros(views, size, size, 4)
     surface[valid] = functional.pad(radiance, (0, 1), value=1.0)
     around = functional.avg_pool2d(surface.permute(0, 3, 1, 2), 3, 1, 1).permute(0, 2, 3, 1)  # for pixels of the edge
-    surface = torch.where(valid[..., None], surface[..., :3], around[..., :3] / around[..., 3:].clamp(min=1e-3))
+    around = torch.where(around[..., 3:] > 0.0, around[..., :3] / around[..., 3:].clamp(min=1e-3), radiance.mean(0))
+    surface = torch.where(valid[..., None], surface[..., :3], around)
     alpha = images[..., 3:]
     background = environment.lookup(directions.reshape(-1, 3)).reshape(surface.shape)
     linear = ((alpha * surface + (1 - alpha) * background) * exposure).clamp(0, SATURATES).clamp(max=1.0)

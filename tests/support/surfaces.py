@@ -22,6 +22,7 @@ class Ball:
         mesh = mesh_from(trimesh.creation.icosphere(subdivisions, radius))
         self.vertices, self.faces, self.finish = mesh.vertices, mesh.faces, finish
         self.scene = RayScene(self.vertices, self.faces)
+        self.outer = torch.ones(len(self.faces), dtype=torch.bool)
 
     def distance(self, points):
         return signed_distance(self.vertices, self.faces, points)

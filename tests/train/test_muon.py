@@ -13,7 +13,7 @@ def run(optimizer, parameter, gradients):
     return parameter.detach()
 
 
-@pytest.mark.parametrize("shape", [(16, 24), (40, 8), (16, 8, 3, 3)])
+@pytest.mark.parametrize("shape", [(16, 24), (40, 16), (16, 8, 3, 3)])
 def test_the_first_step_has_the_singular_vectors_of_the_gradient(shape):
     gradient = torch.randn(shape, generator=torch.Generator().manual_seed(3))
     gradient[: shape[0] // 2] *= 0.05  # small singular values, which need all iterations
@@ -28,7 +28,7 @@ def test_the_first_step_has_the_singular_vectors_of_the_gradient(shape):
 
 if hasattr(torch.optim, "Muon"):  # since torch 2.9
 
-    @pytest.mark.parametrize("shape", [(16, 24), (40, 8), (16, 8, 3, 3)])
+    @pytest.mark.parametrize("shape", [(16, 24), (40, 16), (16, 8, 3, 3)])
     def test_matrices_and_convolutions_follow_muon_of_torch(shape):
         generator = torch.Generator().manual_seed(0)
         start = torch.randn(shape, generator=generator)
@@ -45,7 +45,7 @@ if hasattr(torch.optim, "Muon"):  # since torch 2.9
 
 def test_vectors_small_matrices_and_fast_groups_follow_adamw():
     generator = torch.Generator().manual_seed(1)
-    for shape, times in (((12,), 1.0), ((7, 30), 1.0), ((16, 24), 10.0)):
+    for shape, times in (((12,), 1.0), ((12, 30), 1.0), ((16, 24), 10.0)):
         start = torch.randn(shape, generator=generator)
         gradients = [torch.randn(shape, generator=generator) for _ in range(3)]
         got, want = (torch.nn.Parameter(start.clone()) for _ in range(2))
