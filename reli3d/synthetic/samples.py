@@ -66,11 +66,12 @@ def outer_faces(vertices: Tensor, faces: Tensor, scene: RayScene) -> Tensor:
     """Faces ``(F,)`` bool of which a point, on either side, is not :func:`enclosed`; all if every one is."""
     corners = vertices[faces.long()]
     across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    offset = OFF_SURFACE * functional.normalize(across, dim=-1)[:, None]
-    points = 0.6 * corners + 0.4 * corners.mean(1, keepdim=True)  # between each corner and the center
-    points = torch.cat([points, corners.mean(1, keepdim=True)], 1)
-    sides = torch.cat([points + offset, points - offset], 1)
-    outer = ~enclosed(sides.reshape(-1, 3), scene).view(len(faces), -1).all(1)
+    offset = OFF_SURFACE * functional.normalize(across, dim=-1)
+    center, outer = corners.mean(1), torch.zeros(len(faces), dtype=torch.bool)
+    for points in (center, *(0.4 * center[:, None] + 0.6 * corners).unbind(1)):
+        rows = (~outer).nonzero()[:, 0]
+        sides = torch.stack([points[rows] + offset[rows], points[rows] - offset[rows]], 1)
+        outer[rows] = ~enclosed(sides.reshape(-1, 3), scene).view(-1, 2).all(1)
     return outer if bool(outer.any()) else ~outer
 
 

@@ -106,13 +106,13 @@ def test_a_folder_without_sets_or_with_a_missing_map_is_refused(tmp_path, sets):
 def test_two_objects_of_five_keep_their_base_color_up_to_a_factor(sets):
     base = ball().points_at(*random_faces(ball(), 400, np.random.default_rng(0))).base_color
     factors = []
-    for seed in range(60):
+    for seed in range(120):
         color = refinished(sets, seed, measured=True).base_color
         factor = torch.stack([(color / base)[base[:, k] < 0.1, k].mean() for k in range(3)])  # the dark half: no limit
         if torch.allclose(color, (base * factor).clamp(max=MAX_ALBEDO), atol=1e-6):
             factors.append(factor.log())
-    assert 24 <= len(factors) <= 48  # 0.4, and a quarter of the rest; three standard deviations are 11
+    assert 50 <= len(factors) <= 82  # 0.4, and a quarter of the rest; three standard deviations are 16
     changed = torch.stack([f for f in factors if float(f.abs().max()) > 1e-5])
-    assert 0.35 < len(changed) / len(factors) < 0.85  # 0.6, three standard deviations of 36
+    assert 0.12 < len(changed) / len(factors) < 0.48  # 0.3, three standard deviations of 66
     assert 0.2 < float(changed.mean(1).std()) < 0.45  # 0.31 within three standard errors of 20
     assert 0.06 < float((changed - changed.mean(1, keepdim=True)).std()) < 0.14  # 0.12 of which a third is in the mean
