@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+import warnings
 from fractions import Fraction
 
 import av
@@ -101,6 +102,73 @@ def test_masks_are_found_by_name_before_the_mapping(tmp_path):
     with pytest.raises(InputError, match="at least 8 of 8, got 0"):
         capture(photographs, tmp_path / "object", options)
     assert not (tmp_path / "object").exists()
+
+
+def test_the_exif_orientation_of_masks_is_applied(tmp_path):
+    photographs, masks = tmp_path / "photographs", tmp_path / "masks"
+    for folder in (photographs, masks):
+        folder.mkdir()
+    exif = Image.Exif()
+    exif[BASE.Orientation] = 6
+    for k in range(8):
+        Image.fromarray(textured(k)).save(photographs / f"{k}.jpg", exif=exif)
+        Image.new("L", (320, 240)).save(masks / f"{k}.png")
+    with pytest.raises(InputError, match=r"0\.png: .*240 x 320, got 320 x 240; turn it .* EXIF orientation"):
+        capture(photographs, tmp_path / "object", CaptureOptions(masks=masks))
+    for k in range(8):
+        Image.new("L", (320, 240)).save(masks / f"{k}.png", exif=exif)
+    with pytest.raises(InputError, match="at least 8 of 8, got 0"):  # they fit, but are black
+        capture(photographs, tmp_path / "object", CaptureOptions(masks=masks))
+    exif[BASE.Orientation] = 3
+    mask, notes = textured(0)[..., 0], []
+    Image.fromarray(mask).save(tmp_path / "a.png", exif=exif)
+    assert np.array_equal(decode_image(tmp_path / "a.png", notes=notes, upright=True), mask[::-1, ::-1]) and not notes
+
+
+def test_alpha_is_a_mask_where_all_photographs_have_it(tmp_path):
+    pixels = np.dstack([textured(0), np.zeros((240, 320), np.uint8)])
+    for k in range(8):
+        Image.fromarray(pixels).save(tmp_path / f"{k}.png")
+    with pytest.raises(InputError, match="alpha: expected .* for at least 8 of 8, got 0"):
+        capture(tmp_path, tmp_path / "object")
+    pixels[:, :100, 3] = 255
+    Image.fromarray(pixels).save(tmp_path / "8.png")
+    Image.fromarray(pixels[..., :3]).save(tmp_path / "9.png")
+    photos, notes = read_photos(tmp_path, quiet)
+    assert np.array_equal(photos[8].alpha, pixels[..., 3]) and photos[9].alpha is None
+    assert np.array_equal(photos[8].pixels[:, :100], pixels[:, :100, :3]) and (photos[8].pixels[:, 100:] == 255).all()
+    assert "alpha of 9 of 10 photographs is not used: the others have none; give --masks" in notes
+
+
+def test_names_are_unique_in_any_case_and_keep_their_dots(tmp_path):
+    names = ["12.30.45.png", "12.30.46.png", "A.jpg", "a.png", "a.png.png", "b.png", "c.png", "d.png"]
+    for k, name in enumerate(names):
+        Image.fromarray(textured(k)).save(tmp_path / name)
+    photos, _ = read_photos(tmp_path, quiet)
+    assert [p.name for p in photos] == ["12.30.45", "12.30.46", "A.jpg", "a.png", "a.png.png", "b", "c", "d"]
+
+
+def test_large_photographs_are_read_without_a_warning(tmp_path, monkeypatch):
+    for k in range(8):
+        Image.fromarray(textured(k)).save(tmp_path / f"{k}.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 320 * 240 - 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(read_photos(tmp_path, quiet)[0]) == 8
+
+
+@pytest.mark.parametrize(
+    "values, name, options, message",
+    [
+        (np.full((9, 9), 0.5, np.float32), "0.tif", {}, "expected 8 or 16 bit gray or color, got mode F; save as"),
+        (np.full((9, 9), 70000, np.int32), "0.tif", {}, "expected 8 or 16 bit gray, got 32 bit; save as"),
+        (np.zeros((9, 9), np.uint8), "0.jpg", {"format": "BMP"}, "cannot be decoded"),  # as PostScript, which is run
+    ],
+)
+def test_what_an_object_folder_cannot_hold_is_no_photograph_either(tmp_path, values, name, options, message):
+    Image.fromarray(values).save(tmp_path / name, **options)
+    with pytest.raises(InputError, match=message):
+        read_photos(tmp_path, quiet)
 
 
 def test_flash_and_mixed_sizes_are_reported(tmp_path):
