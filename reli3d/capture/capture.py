@@ -113,9 +113,13 @@ def capture(
     _check_options(options)
     _check_output(source, output, options.masks)
     photos, notes = read_photos(source, progress)
+    cut_out = all(p.alpha is not None for p in photos)
+    if cut_out and options.masks is None and options.mask_method == "grabcut":
+        options = replace(options, mask_method="alpha")
+        notes.append("the alpha of the photographs is used as masks")
     report = CaptureReport(len(photos), notes=notes, mask_method="given" if options.masks else options.mask_method)
     region = None
-    if options.turntable is not False:
+    if options.turntable or options.turntable is None and not cut_out:  # detected by the background
         region = moving_region([p.pixels for p in photos], fixed=bool(options.turntable))
     if options.turntable and region is None:
         raise InputError("turntable", "expected images of one size in which the object turns, got others")
@@ -187,7 +191,7 @@ def _check_output(source: Path, output: Path, masks: Path | None) -> None:
 
 
 def _known_masks(photos: Sequence[Photo], options: CaptureOptions, progress: Progress) -> dict[str, np.ndarray] | None:
-    """Masks that need no map: given ones, by color, or by a network.  None for those of the map's points."""
+    """Masks that need no map: given ones, alpha, by color, or by a network.  None for those of the map's points."""
     if options.masks is None and options.mask_method == "grabcut":
         return None
     found: dict[str, np.ndarray] = {}
@@ -196,6 +200,8 @@ def _known_masks(photos: Sequence[Photo], options: CaptureOptions, progress: Pro
         progress("masks", k, len(photos))
         if options.masks:
             mask = _given_mask(options.masks, photo)
+        elif options.mask_method == "alpha":
+            mask = photo.alpha
         elif remover:
             mask = np.asarray(remover.mask(Image.fromarray(photo.pixels)))
         else:
@@ -206,6 +212,8 @@ def _known_masks(photos: Sequence[Photo], options: CaptureOptions, progress: Pro
         where, what = "mask-method", "images of one object before a uniform background"
         if options.masks:
             where, what = str(options.masks), "masks with the names of the photographs, such as IMG_1.png of IMG_1.jpg,"
+        elif options.mask_method == "alpha":
+            where, what = "alpha", "an object that is opaque, or --masks,"
         raise InputError(where, f"expected {what} for at least {FEWEST} of {len(photos)}, got {len(found)}")
     return found
 
@@ -221,10 +229,14 @@ def _given_mask(folder: Path, photo: Photo) -> np.ndarray | None:
         return None
     if len(files) > 1:
         raise InputError(folder, f"expected one mask of {printable(photo.name)}, got {files[0].name}, {files[1].name}")
-    coverage = unit(mask_values(files[0], decode_image(files[0]), []))  # the note on values below white is left out
+    bitmap = decode_image(files[0], upright=True)
+    coverage = unit(mask_values(files[0], bitmap, []))  # the note on values below white is left out
     mask = np.rint(255 * coverage).astype(np.uint8)
-    if abs(mask.shape[1] * photo.size[1] / (mask.shape[0] * photo.size[0]) - 1) > 0.01:
-        raise InputError(files[0], f"expected the aspect of {photo.size[0]} x {photo.size[1]}, got {mask.shape[::-1]}")
+    (width, height), (w, h) = photo.size, bitmap.size
+    if abs(w * height / (h * width) - 1) > 0.01:
+        turned = abs(h * height / (w * width) - 1) <= 0.01
+        fix = "turn it upright, as the EXIF orientation of the photograph says" if turned else "save it at that size"
+        raise InputError(files[0], f"expected the aspect of {width} x {height}, got {w} x {h}; {fix}")
     return cv2.resize(mask, photo.size, interpolation=cv2.INTER_AREA)
 
 
@@ -511,26 +523,24 @@ def _check(report: CaptureReport) -> None:
 
 
 def _write(output: Path, views, masks, frame: Frame, box: np.ndarray, report: CaptureReport, points, progress) -> None:
-    stems = [Path(v.photo.name).stem for v in views]
-    if len(set(stems)) < len(stems):
-        stems = [f"{k:04d}" for k in range(len(views))]
     with claimed(output, RESULT_FILES) as replacing, replacing() as work:
         frames, thumbnails = [], []
         for name in ("images", "masks"):
             (work / name).mkdir()
-        for k, (stem, view) in enumerate(zip(stems, views, strict=True)):
+        for k, view in enumerate(views):
+            name = view.photo.name
             progress("writing", k, len(views))
             image = view.undistorted(view.photo.pixels)
             mask = view.undistorted(masks[view.photo.name])
-            Image.fromarray(image).save(work / "images" / f"{stem}.jpg", quality=95, subsampling=0)
-            Image.fromarray(mask).save(work / "masks" / f"{stem}.png")
+            Image.fromarray(image).save(work / "images" / f"{name}.jpg", quality=95, subsampling=0)
+            Image.fromarray(mask).save(work / "masks" / f"{name}.png")
             pose = _c2w(view)
             pose[:3, :3] = frame.turn @ pose[:3, :3]
             pose[:3, 3] = frame.apply(view.eye)
             frames.append(
                 {
-                    "file_path": f"images/{stem}.jpg",
-                    "mask_path": f"masks/{stem}.png",
+                    "file_path": f"images/{name}.jpg",
+                    "mask_path": f"masks/{name}.png",
                     "transform_matrix": pose.tolist(),
                     "fl_x": view.focal,
                     "fl_y": view.focal,
@@ -540,7 +550,7 @@ def _write(output: Path, views, masks, frame: Frame, box: np.ndarray, report: Ca
                     "h": view.photo.size[1],
                 }
             )
-            thumbnails.append((view.photo.name, image, mask, replace(view, radial=0.0)))
+            thumbnails.append((name, image, mask, replace(view, radial=0.0)))
         content = {
             "camera_model": "PINHOLE",
             "lighting": report.lighting,

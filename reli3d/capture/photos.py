@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,8 @@ from PIL import ExifTags, Image, ImageOps
 
 from reli3d.errors import InputError, shown
 from reli3d.io.files import file_size
-from reli3d.io.images import in_srgb
+from reli3d.io.images import FORMATS, check_depth, in_srgb
+from reli3d.views.masks import alpha_values
 from reli3d.views.missing_cameras import PHOTOGRAPHS, VIDEOS
 
 LONGEST_SIDE = 2000  # pixels of a photograph that is kept
@@ -40,6 +42,7 @@ class Photo:
     focal: float | None  # pixels, from EXIF; None if it is missing
     lens: tuple  # equal for photographs of one lens and size
     flash: bool = False
+    alpha: np.ndarray | None = None  # (H, W) uint8, if some of it is transparent: a mask
 
     @property
     def size(self) -> tuple[int, int]:
@@ -65,6 +68,8 @@ def read_photos(source: Path, progress: Progress) -> tuple[list[Photo], list[str
             source, f"expected at least {FEWEST} photographs, got {len(photos)}; take 30 to 70 all around the object"
         )
     sizes = {p.size for p in photos}
+    if 0 < (cut_out := sum(p.alpha is not None for p in photos)) < len(photos):
+        notes.append(f"alpha of {cut_out} of {len(photos)} photographs is not used: the others have none; give --masks")
     if len(sizes) > 1:
         notes.append(f"{len(sizes)} image sizes: each is calibrated as a camera of its own")
     flashes = sum(p.flash for p in photos)
@@ -88,11 +93,11 @@ def _read_folder(folder: Path, progress: Progress) -> tuple[list[Photo], list[st
     if step > 1:
         notes.append(f"one of {step} photographs is read: {len(files[::step])} of {len(files)}")
         files = files[::step]
-    stems = [p.stem for p in files]
+    taken = [name.casefold() for p in files for name in (p.stem, p.name)]
     photos, converted = [], list[str]()
     for k, path in enumerate(files):
         progress("reading", k, len(files))
-        name = path.stem if stems.count(path.stem) == 1 else path.name
+        name = path.stem if taken.count(path.stem.casefold()) == 1 else path.name
         photos.append(_read_photo(path, name, converted))
     progress("reading", len(files), len(files))
     if converted:
@@ -110,8 +115,12 @@ def optional_module(module: str) -> ModuleType:
 
 def _read_photo(path: Path, name: str, notes: list[str]) -> Photo:
     file_size(path)
+    formats = (*FORMATS, *({"HEIF"} & Image.OPEN.keys()))
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit is MAX_PIXELS
+            image = Image.open(path, formats=formats)
+        with image:
             if image.width * image.height > MAX_PIXELS:
                 raise InputError(path, f"expected at most {MAX_PIXELS} pixels, got {image.width} x {image.height}")
             exif = image.getexif()
@@ -119,10 +128,16 @@ def _read_photo(path: Path, name: str, notes: list[str]) -> Photo:
             stored = image.size
             image.draft("RGB", (LONGEST_SIDE, LONGEST_SIDE))
             upright = ImageOps.exif_transpose(image)
-            if upright.mode.startswith("I;16"):
+            check_depth(path, upright)
+            upright = in_srgb(upright, path.name, notes)
+            if upright.mode.startswith("I"):
                 upright = Image.fromarray((np.asarray(upright) >> 8).astype(np.uint8))
-            upright = in_srgb(upright, path.name, notes).convert("RGB")
+            upright = upright.convert("RGBA" if upright.has_transparency_data else "RGB")
             upright.thumbnail((LONGEST_SIDE, LONGEST_SIDE), Image.Resampling.BOX, reducing_gap=None)
+            alpha = alpha_values(upright, [])
+            if alpha:  # on white: the hidden color is arbitrary, or shows what was removed
+                upright = Image.composite(upright, Image.new("RGBA", upright.size, "white"), alpha)
+            upright = upright.convert("RGB")
     except InputError:
         raise
     except Exception as error:  # decoders raise almost anything on a broken file
@@ -131,7 +146,7 @@ def _read_photo(path: Path, name: str, notes: list[str]) -> Photo:
     focal = focal_from_exif(tags, stored, longest)
     lens = (upright.size, str(tags.get(ExifTags.Base.Model, "")), round(focal) if focal else None)
     fired = int(_number(tags.get(ExifTags.Base.Flash), 0.0)) % 2 == 1  # the other bits say how it was set
-    return Photo(name, np.asarray(upright), focal, lens, fired)
+    return Photo(name, np.asarray(upright), focal, lens, fired, np.asarray(alpha) if alpha else None)
 
 
 def focal_from_exif(tags: dict, stored: tuple[int, int], longest: int) -> float | None:

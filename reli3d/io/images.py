@@ -8,6 +8,7 @@ image size in the camera file fits only the rotated image.
 import io
 import os
 import re
+import struct
 import warnings
 import zlib
 from pathlib import Path
@@ -15,7 +16,7 @@ from threading import BoundedSemaphore, Lock
 
 import numpy as np
 import torch
-from PIL import Image, ImageCms, ImageOps
+from PIL import ExifTags, Image, ImageChops, ImageCms, ImageOps
 from torch import Tensor
 
 from reli3d.errors import InputError, printable, shown
@@ -46,6 +47,7 @@ _DECODING = BoundedSemaphore(2)  # images at a time: one of 24 MP takes 96 MB
 _OPENING = Lock()  # Python's warning filters are global; decoding runs outside
 _GRAY = ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I")
 _COLOR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
+_CUBE = Image.fromarray(np.indices((6, 6, 6)).reshape(3, 36, 6).transpose(1, 2, 0).astype(np.uint8) * 51)  # all of RGB
 
 
 class _Reader(io.BufferedReader):
@@ -88,14 +90,18 @@ def above(channel: Image.Image, limit: float) -> np.ndarray:
 
 
 def decode_image(
-    path: str | os.PathLike, *, notes: list[str] | None = None, calibrated: tuple[int, int] | None = None
+    path: str | os.PathLike,
+    *,
+    notes: list[str] | None = None,
+    calibrated: tuple[int, int] | None = None,
+    upright: bool = False,
 ) -> Image.Image:
     """Decodes an image to mode RGB, RGBA, L, or F for 16-bit gray in [0, 65535].
 
     Reads PNG, JPEG, WebP or TIFF: 8-bit color, palette, gray, CMYK, 16-bit gray; 16-bit color is reduced to 8 bits.
     The size is checked before decoding.  notes: receives changes of the pixels.  calibrated: width and height in the
-    camera file; the EXIF orientation is applied if only the rotated image has this aspect ratio.  Raises InputError for
-    other formats, more than 64 MP, several frames, or a broken file.
+    camera file; the EXIF orientation is applied if only the rotated image has this aspect ratio.  upright: it is always
+    applied.  Raises InputError for other formats, more than 64 MP, several frames, or a broken file.
     """
     size = file_size(path)
     if size > MAX_BYTES:
@@ -107,7 +113,7 @@ def decode_image(
                 warnings.simplefilter("ignore", UserWarning)  # broken EXIF or TIFF tags that the pixels do not need
                 image = Image.open(file, formats=FORMATS)  # reads the header only
             with image, _DECODING:
-                return _decoded(path, image, notes if notes is not None else [], calibrated)
+                return _decoded(path, image, notes if notes is not None else [], calibrated, upright)
     except InputError:
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
@@ -122,7 +128,9 @@ def decode_image(
         raise InputError(path, f"cannot be decoded ({shown(str(error))}); save the image again") from None
 
 
-def _decoded(path, image: Image.Image, notes: list[str], calibrated: tuple[int, int] | None) -> Image.Image:
+def _decoded(
+    path, image: Image.Image, notes: list[str], calibrated: tuple[int, int] | None, upright: bool
+) -> Image.Image:
     width, height = image.size
     if width * height > MAX_PIXELS:
         raise InputError(path, f"expected at most {MAX_PIXELS} pixels, got {width} x {height}; scale the image down")
@@ -132,52 +140,93 @@ def _decoded(path, image: Image.Image, notes: list[str], calibrated: tuple[int, 
         raise InputError(path, "expected one image, got several frames; save a single frame")
     if image.format in ("JPEG", "MPO") and (scans := _scans(path)) > MAX_SCANS:
         raise InputError(path, f"expected at most {MAX_SCANS} scans, got {scans}; save the image again")
-    if image.mode not in _GRAY + _COLOR:
-        raise InputError(path, f"expected 8 or 16 bit gray or color, got mode {image.mode}; save as 8 bit PNG")
     orientation = image.getexif().get(ORIENTATION, 1)
     if orientation not in (0, 1):
         name = f"{os.path.basename(path)}: EXIF orientation {shown(orientation)}"
         tiff = image.format == "TIFF"  # Pillow turns it and exchanges the sides before
         stored = image.size[::-1] if tiff and orientation in QUARTER_TURNS else image.size
-        applied = calibrated and _aspect(calibrated, stored[::-1]) and not _aspect(calibrated, stored)
-        if calibrated and applied:
+        fits = calibrated and _aspect(calibrated, stored[::-1]) and not _aspect(calibrated, stored)
+        applied = upright or fits
+        if calibrated and fits:
             notes.append(f"{name} applied: the camera file has {calibrated[0]} x {calibrated[1]} pixels")
-        else:
+        elif not upright:
             notes.append(f"{name} not applied, cameras refer to stored pixels")
         if tiff:
             image.load()
             image = image if applied or orientation not in UNTURNED else image.transpose(UNTURNED[orientation])
         elif applied:
             image = ImageOps.exif_transpose(image)
-    if image.mode.startswith("I"):
-        gray = np.asarray(image).astype(np.float32)
-        if image.mode == "I" and (gray.min() < 0 or gray.max() > 65535):
-            raise InputError(path, "expected 8 or 16 bit gray, got 32 bit; save as 8 bit PNG")
-        return Image.fromarray(gray)
+    check_depth(path, image)
     image = in_srgb(image, os.path.basename(path), notes)
-    transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
-    mode = "RGBA" if transparent else "L" if image.mode in ("1", "L") else "RGB"
+    if image.mode.startswith("I"):
+        return Image.fromarray(np.asarray(image).astype(np.float32))
+    mode = "RGBA" if image.has_transparency_data else "L" if image.mode in ("1", "L") else "RGB"
     image.load()
     return image if image.mode == mode else image.convert(mode)
 
 
+def check_depth(path: str | os.PathLike, image: Image.Image) -> None:
+    """Raises InputError unless ``image`` is color or gray of 8 or 16 bits."""
+    if image.mode not in _GRAY + _COLOR:
+        raise InputError(path, f"expected 8 or 16 bit gray or color, got mode {image.mode}; save as 8 bit PNG")
+    if image.mode == "I" and not 0 <= np.asarray(image).min() <= np.asarray(image).max() <= 65535:
+        raise InputError(path, "expected 8 or 16 bit gray, got 32 bit; save as 8 bit PNG")
+
+
 def in_srgb(image: Image.Image, name: str, notes: list[str]) -> Image.Image:
-    """``image``, RGB or RGBA, converted from the color space of its ICC profile, such as Display P3, with a note."""
+    """``image`` converted to sRGB, RGB or RGBA, from the color space of its ICC profile or EXIF data, with a note.
+
+    Unchanged where neither names one, or one equal to sRGB up to rounding.  Profiles of gray images are not used.
+    """
     profile = image.info.get("icc_profile")
-    if not profile or image.mode not in ("RGB", "RGBA"):
+    if not profile and _is_adobe_rgb(image):
+        profile = _adobe_rgb()
+    if not profile:
         return image
+    if image.mode in _GRAY:
+        notes.append("color profiles of gray images are not used, sRGB is assumed")
+        return image
+    mode = "RGBA" if image.has_transparency_data else "RGB"
     try:
-        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        source, target = ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")
+        if image.mode != "CMYK":
+            converted = ImageCms.buildTransform(source, target, "RGB", "RGB").apply(_CUBE)
+            if np.asarray(ImageChops.difference(converted, _CUBE)).max() <= 1:  # linear profiles may be named sRGB
+                return image
+            image = image if image.mode == mode else image.convert(mode)
         title = ImageCms.getProfileDescription(source).strip()
-        if "srgb" in title.lower():
-            return image
-        target = ImageCms.createProfile("sRGB")
-        converted = ImageCms.profileToProfile(image, source, target, outputMode=image.mode)
+        converted = ImageCms.buildTransform(source, target, image.mode, mode).apply(image)
     except (ImageCms.PyCMSError, ImportError, OSError, ValueError, TypeError) as error:
         notes.append(f"{name}: its color profile is not used ({shown(str(error))}), sRGB is assumed")
         return image
     notes.append(f"{name}: colors converted from {printable(title)}{CONVERTED}")
-    return converted or image
+    return converted
+
+
+def _is_adobe_rgb(image: Image.Image) -> bool:
+    """Whether EXIF has an uncalibrated color space and the interoperability index R03: Adobe RGB (DCF 2.0)."""
+    if b"R03\0" not in image.info.get("exif", b""):  # spares the EXIF data of most images, which may be broken
+        return False
+    return image.getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.ColorSpace) == 0xFFFF
+
+
+def _adobe_rgb() -> bytes:
+    """ICC profile of Adobe RGB (1998): an exponent of 563/256, and its primaries adapted to D50."""
+
+    def xyz(*values: float) -> bytes:
+        return struct.pack(">4s4x3i", b"XYZ ", *(round(65536 * value) for value in values))
+
+    white = xyz(0.9642, 1.0, 0.8249)
+    primaries = xyz(0.60974, 0.31111, 0.01947), xyz(0.20528, 0.62567, 0.06087), xyz(0.14919, 0.06322, 0.74457)
+    curve = struct.pack(">4s4xIH2x", b"curv", 1, 563)
+    title = struct.pack(">4s4xI17s79x", b"desc", 17, b"Adobe RGB (1998)")
+    values = (title, white, *primaries, *3 * (curve,))
+    names = (b"desc", b"wtpt", b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC")
+    ends = 132 + 12 * len(values) + np.cumsum([len(value) for value in values])
+    entries = zip(names, ends, values, strict=True)
+    table = b"".join(struct.pack(">4s2I", name, end - len(value), len(value)) for name, end, value in entries)
+    header = struct.pack(">I4xI12s12x4s28x12s48x", ends[-1], 0x02100000, b"mntrRGB XYZ ", b"acsp", white[8:])
+    return header + struct.pack(">I", len(values)) + table + b"".join(values)
 
 
 def _aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:

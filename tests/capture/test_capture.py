@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from reli3d.capture.capture import capture
 from reli3d.errors import InputError
@@ -68,6 +69,21 @@ def test_two_runs_write_equal_files(ground_truth, captured, tmp_path):
     files = [p.relative_to(folder) for p in sorted(folder.rglob("*")) if p.is_file()]
     assert len(files) > 40
     assert all((folder / p).read_bytes() == (tmp_path / "object" / p).read_bytes() for p in files)
+
+
+def test_alpha_of_cut_out_photographs_is_used_as_masks(ground_truth, tmp_path):
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    for k, (image, mask) in enumerate(zip(ground_truth.images, ground_truth.masks, strict=True)):
+        cut_out = np.dstack([image, np.uint8(255) * mask])
+        Image.fromarray(cut_out).save(photographs / f"12.30.{k:02d}.png")  # names that differ after a dot alone
+    report = capture(photographs, tmp_path / "object")
+    assert report.mask_method == "alpha" and report.lighting == "object" and not report.failed
+    masks = sorted((tmp_path / "object" / "masks").iterdir())
+    assert [p.stem for p in masks] == report.views and len(masks) >= 12  # found 17 of 20
+    for path in masks:
+        got, expected = np.asarray(Image.open(path)) > 127, ground_truth.masks[int(path.stem[-2:])]
+        assert (got & expected).sum() / (got | expected).sum() > 0.98  # resampled: the lens is estimated
 
 
 @pytest.mark.slow

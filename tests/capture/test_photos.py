@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+import struct
+import warnings
 from fractions import Fraction
 
 import av
 import numpy as np
 import pillow_heif
 import pytest
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageCms
 
 from reli3d.capture.capture import CaptureOptions, capture
 from reli3d.capture.photos import FEWEST, FRAME_COUNT, focal_from_exif, read_photos, sharpness
@@ -102,6 +104,73 @@ def test_masks_are_found_by_name_before_the_mapping(tmp_path):
     assert not (tmp_path / "object").exists()
 
 
+def test_the_exif_orientation_of_masks_is_applied(tmp_path):
+    photographs, masks = tmp_path / "photographs", tmp_path / "masks"
+    for folder in (photographs, masks):
+        folder.mkdir()
+    exif = Image.Exif()
+    exif[BASE.Orientation] = 6
+    for k in range(8):
+        Image.fromarray(textured(k)).save(photographs / f"{k}.jpg", exif=exif)
+        Image.new("L", (320, 240)).save(masks / f"{k}.png")
+    with pytest.raises(InputError, match=r"0\.png: .*240 x 320, got 320 x 240; turn it .* EXIF orientation"):
+        capture(photographs, tmp_path / "object", CaptureOptions(masks=masks))
+    for k in range(8):
+        Image.new("L", (320, 240)).save(masks / f"{k}.png", exif=exif)
+    with pytest.raises(InputError, match="at least 8 of 8, got 0"):  # they fit, but are black
+        capture(photographs, tmp_path / "object", CaptureOptions(masks=masks))
+    exif[BASE.Orientation] = 3
+    mask, notes = textured(0)[..., 0], []
+    Image.fromarray(mask).save(tmp_path / "a.png", exif=exif)
+    assert np.array_equal(decode_image(tmp_path / "a.png", notes=notes, upright=True), mask[::-1, ::-1]) and not notes
+
+
+def test_alpha_is_a_mask_where_all_photographs_have_it(tmp_path):
+    pixels = np.dstack([textured(0), np.zeros((240, 320), np.uint8)])
+    for k in range(8):
+        Image.fromarray(pixels).save(tmp_path / f"{k}.png")
+    with pytest.raises(InputError, match="alpha: expected .* for at least 8 of 8, got 0"):
+        capture(tmp_path, tmp_path / "object")
+    pixels[:, :100, 3] = 255
+    Image.fromarray(pixels).save(tmp_path / "8.png")
+    Image.fromarray(pixels[..., :3]).save(tmp_path / "9.png")
+    photos, notes = read_photos(tmp_path, quiet)
+    assert np.array_equal(photos[8].alpha, pixels[..., 3]) and photos[9].alpha is None
+    assert np.array_equal(photos[8].pixels[:, :100], pixels[:, :100, :3]) and (photos[8].pixels[:, 100:] == 255).all()
+    assert "alpha of 9 of 10 photographs is not used: the others have none; give --masks" in notes
+
+
+def test_names_are_unique_in_any_case_and_keep_their_dots(tmp_path):
+    names = ["12.30.45.png", "12.30.46.png", "A.jpg", "a.png", "a.png.png", "b.png", "c.png", "d.png"]
+    for k, name in enumerate(names):
+        Image.fromarray(textured(k)).save(tmp_path / name)
+    photos, _ = read_photos(tmp_path, quiet)
+    assert [p.name for p in photos] == ["12.30.45", "12.30.46", "A.jpg", "a.png", "a.png.png", "b", "c", "d"]
+
+
+def test_large_photographs_are_read_without_a_warning(tmp_path, monkeypatch):
+    for k in range(8):
+        Image.fromarray(textured(k)).save(tmp_path / f"{k}.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 320 * 240 - 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(read_photos(tmp_path, quiet)[0]) == 8
+
+
+@pytest.mark.parametrize(
+    "values, name, options, message",
+    [
+        (np.full((9, 9), 0.5, np.float32), "0.tif", {}, "expected 8 or 16 bit gray or color, got mode F; save as"),
+        (np.full((9, 9), 70000, np.int32), "0.tif", {}, "expected 8 or 16 bit gray, got 32 bit; save as"),
+        (np.zeros((9, 9), np.uint8), "0.jpg", {"format": "BMP"}, "cannot be decoded"),  # as PostScript, which is run
+    ],
+)
+def test_what_an_object_folder_cannot_hold_is_no_photograph_either(tmp_path, values, name, options, message):
+    Image.fromarray(values).save(tmp_path / name, **options)
+    with pytest.raises(InputError, match=message):
+        read_photos(tmp_path, quiet)
+
+
 def test_flash_and_mixed_sizes_are_reported(tmp_path):
     # fired: 1 and auto, 0x19; not fired: off, 0x10, and auto, 0x18
     for k, flash in enumerate([0x01, 0x19, 0x19, 0x10, 0x18, 0x18, 0x00, 0x20]):
@@ -168,13 +237,16 @@ def test_high_definition_video_without_a_color_space_is_bt_709(tmp_path, tagged)
     assert np.abs(photos[0].pixels[300, 300].astype(int) - (200, 40, 40)).max() <= 3
 
 
-def display_p3() -> bytes:
-    """A matrix profile with the primaries of Display P3, adapted to D50, and an exponent of 2.2."""
+DISPLAY_P3 = (0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)  # adapted to D50
+SRGB = (0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)
+
+
+def matrix_profile(title: str, columns: tuple, exponent: float) -> bytes:
+    """An ICC profile with the XYZ of red, green and blue, and an exponent."""
     number = lambda v: round(v * 65536).to_bytes(4, "big", signed=True)  # noqa: E731
     xyz = lambda *v: b"XYZ \0\0\0\0" + b"".join(map(number, v))  # noqa: E731
-    columns = (0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)
-    curve = b"curv\0\0\0\0" + (1).to_bytes(4, "big") + round(2.2 * 256).to_bytes(2, "big") + b"\0\0"
-    name = b"Display P3\0"
+    curve = b"curv\0\0\0\0" + (1).to_bytes(4, "big") + round(exponent * 256).to_bytes(2, "big") + b"\0\0"
+    name = title.encode() + b"\0"
     text = b"desc\0\0\0\0" + len(name).to_bytes(4, "big") + name + b"\0" * (79 + -len(name) % 4)
     tags = {b"desc": text, b"wtpt": xyz(0.9642, 1.0, 0.8249), **dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve)}
     tags |= {key: xyz(*column) for key, column in zip((b"rXYZ", b"gXYZ", b"bXYZ"), columns, strict=True)}
@@ -190,14 +262,73 @@ def display_p3() -> bytes:
 
 def test_photographs_in_display_p3_are_converted(tmp_path):
     """sRGB (200, 30, 30) lies at (183, 51, 42) there; an exponent of 2.2 differs from sRGB's curve by up to 6."""
+    profile = matrix_profile("Display P3", DISPLAY_P3, 2.2)
     for k in range(8):
-        Image.new("RGB", (320, 240), (183, 51, 42)).save(tmp_path / f"{k}.png", icc_profile=display_p3())
+        Image.new("RGB", (320, 240), (183, 51, 42)).save(tmp_path / f"{k}.png", icc_profile=profile)
     photos, notes = read_photos(tmp_path, quiet)
     assert np.abs(photos[0].pixels[100, 100].astype(int) - (200, 30, 30)).max() <= 7
     assert any("converted from Display P3 to sRGB; 8 of 8" in note for note in notes)
     found = []
     bitmap = decode_image(tmp_path / "0.png", notes=found)
     assert np.array_equal(np.asarray(bitmap), photos[0].pixels) and "Display P3" in found[0]
+
+
+def test_a_profile_is_judged_by_its_colors(tmp_path):
+    """sRGB's curve takes the linear values 0.5 and 0.1 to 188 and 89."""
+    linear = matrix_profile("GIMP built-in Linear sRGB", SRGB, 1.0)
+    same = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    color, path = Image.new("RGB", (9, 9), (128, 128, 26)), tmp_path / "a.png"
+    for image, profile, expected, note in (
+        (color, same, (128, 128, 26), ""),
+        (color, linear, (188, 188, 89), "converted from GIMP"),
+        (color.quantize(2), linear, (188, 188, 89), "converted from GIMP"),
+        (color.convert("L"), linear, (118, 118, 118), "profiles of gray images are not used"),
+    ):
+        notes: list[str] = []
+        image.save(path, icc_profile=profile)
+        bitmap = decode_image(path, notes=notes).convert("RGB")
+        assert np.abs(np.subtract(bitmap.getpixel((0, 0)), expected)).max() <= 2  # each step rounds to 8 bits
+        assert note in "".join(notes) and len(notes) == bool(note)
+
+
+def ink_profile() -> bytes:
+    """A CMYK profile whose only color is the lightness of white without black ink, and of black with it."""
+    ramp = bytes(range(256))
+    nodes = b"".join(bytes([0 if k % 2 else 255, 128, 128]) for k in range(16))  # L*a*b*; the last ink changes first
+    lut = struct.pack(">4s4x4B9i", b"mft1", 4, 3, 2, 0, *(65536 * v for v in (1, 0, 0, 0, 1, 0, 0, 0, 1)))
+    lut += 4 * ramp + nodes + 3 * ramp
+    tags = struct.pack(">I4s2I", 1, b"A2B0", 144, len(lut))
+    header = struct.pack(
+        ">I4xI12s12x4s28x3i48x", 144 + len(lut), 0x02100000, b"prtrCMYKLab ", b"acsp", 63190, 65536, 54061
+    )
+    return header + tags + lut
+
+
+def test_cmyk_is_converted_by_its_profile(tmp_path):
+    for profile, expected, note in (
+        (ink_profile(), (255, 255, 255), "colors converted from"),
+        (matrix_profile("RGB", SRGB, 1.0), (255, 0, 0), "its color profile is not used"),
+    ):
+        notes: list[str] = []
+        Image.new("CMYK", (16, 16), (0, 255, 255, 0)).save(tmp_path / "a.tif", icc_profile=profile)
+        bitmap = decode_image(tmp_path / "a.tif", notes=notes)
+        assert bitmap.mode == "RGB" and np.abs(np.subtract(bitmap.getpixel((0, 0)), expected)).max() <= 2
+        assert note in notes[0] and len(notes) == 1
+
+
+def test_adobe_rgb_is_known_by_exif_alone(tmp_path):
+    """Adobe RGB (1998) encoding, 4.3: an exponent of 563/256; the matrix to linear sRGB, of both XYZ matrices."""
+    exif, path = Image.Exif(), tmp_path / "0.jpg"
+    ifd = exif.get_ifd(ExifTags.IFD.Exif)
+    stored, matrix = (60, 180, 90), [[1.39836, -0.39836, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04293, 1.04293]]
+    linear = np.clip(matrix @ (np.array(stored) / 255) ** (563 / 256), 0, 1)
+    converted = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055) * 255
+    for space, index, expected in ((65535, "R03", converted), (65535, "R98", stored), (1, "R03", stored)):
+        ifd[BASE.ColorSpace], ifd[ExifTags.IFD.Interop], notes = space, {1: index}, []
+        Image.new("RGB", (16, 16), stored).save(path, exif=exif, quality=100)
+        pixel = decode_image(path, notes=notes).getpixel((8, 8))
+        assert np.abs(np.subtract(pixel, expected)).max() <= 3  # JPEG rounds to 8 bits twice
+        assert notes == ["0.jpg: colors converted from Adobe RGB (1998) to sRGB"] * (expected is converted)
 
 
 def test_the_sharpest_frame_of_each_window_of_a_video_is_taken(tmp_path):
