@@ -29,6 +29,7 @@ from reli3d.kernels.cache import CPU_BLOCK, LOADING, initialize, repaired
 WORKER = "reli3d-slice"  # name prefix of the pool's threads
 SLICES = 16  # per launch: balances uneven work on 2 to 8 cores; each adds 20 us of launch overhead
 COMPILERS = 4  # modules compiled concurrently; each thread builds its own precompiled header, 1.5 CPU seconds
+ACCUMULATED = 1 << 27  # elements of the gradients of one input that the slices of a launch accumulate, all together
 SLICE_MIN = 1024  # kernel threads per slice: below this a slice costs about as much to launch as to run
 
 T = TypeVar("T")
@@ -76,6 +77,11 @@ def slices(n: int, slice_min: int = SLICE_MIN) -> list[tuple[int, int]]:
     parts = max(1, min(SLICES, n // slice_min))
     edges = [n * k // parts for k in range(parts + 1)]
     return [(a, b - a) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def slice_of_accumulators(n: int, slice_min: int, elements: int) -> int:
+    """The ``slice_min`` above which the slices of ``n`` threads accumulate ``elements`` each, ACCUMULATED in total."""
+    return max(slice_min, -(-n // max(1, ACCUMULATED // max(1, elements))))
 
 
 def over_slices(n: int, work, *, slice_min: int = SLICE_MIN) -> list:
@@ -155,6 +161,8 @@ def stream(device: torch.device):
 
 def view(tensor: Tensor, dtype):
     """Zero-copy Warp array descriptor of a contiguous tensor, without gradient."""
+    if not tensor.numel():  # torch calls it contiguous whatever its strides
+        tensor = torch.empty(tensor.shape, dtype=tensor.dtype, device=tensor.device)
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 
@@ -299,6 +307,8 @@ class _KernelOp(torch.autograd.Function):
         slots = [i for i, value in enumerate(ins) if value is _SLOT]
         tensors, results = ctx.saved_tensors[: len(slots)], ctx.saved_tensors[len(slots) :]
         types, device, needed = _element_types(kernel), tensors[0].device, ctx.needs_input_grad[6:]
+        largest = max((t.numel() for i, t in enumerate(tensors) if i in shared and needed[i]), default=0)
+        slice_min = slice_of_accumulators(n, slice_min, largest)
         parts = slices(n, slice_min) if device.type == "cpu" else [(0, n)]
         grads = [
             torch.zeros((len(parts) if i in shared else 1, *t.shape), dtype=t.dtype, device=device) if w else None

@@ -5,6 +5,8 @@ misses if it hits nothing, if it contains a NaN, an infinity or a zero direction
 float32.  A miss has ``face = -1``, ``t = inf``, ``bary = 0``.  Only :meth:`RayScene.intersect` has gradients.
 """
 
+from functools import partial
+
 import numpy as np
 import torch
 import warp as wp
@@ -180,6 +182,9 @@ class RayScene:
         self.vertices = vertices.detach().clone().contiguous()
         self._cells = cells  # lower corner of the mesh, and quarters of its box per unit
         self.scale = scale  # largest coordinate of the mesh: the step off a face is a multiple of it
+
+    def __reduce__(self):  # copies and pickles build their own structure: it holds pointers
+        return partial(RayScene, backend=self.backend), (self.vertices, self.faces)
 
     def _build(self) -> None:
         if self.faces.shape[0] == 0:

@@ -39,7 +39,6 @@ UNTURNED = {  # what restores the stored pixels
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_270,
 }
-CONVERTED = " to sRGB"  # end of the note on a converted image
 _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # start of a JPEG segment; other bytes after 0xff are data
 ASPECT = 0.01  # relative difference up to which two sizes have the same aspect
 _TOP = {"L": 255, "RGB": 255, "RGBA": 255, "F": 65535}  # mode: the value that is 1
@@ -199,7 +198,7 @@ def in_srgb(image: Image.Image, name: str, notes: list[str]) -> Image.Image:
     except (ImageCms.PyCMSError, ImportError, OSError, ValueError, TypeError) as error:
         notes.append(f"{name}: its color profile is not used ({shown(str(error))}), sRGB is assumed")
         return image
-    notes.append(f"{name}: colors converted from {printable(title)}{CONVERTED}")
+    notes.append(f"{name}: colors converted from {printable(title)} to sRGB")
     return converted
 
 

@@ -102,7 +102,7 @@ def tangent_frame(normal: Tensor) -> Tensor:
     """
     check("normal", normal, last=3)
     x, y, z = normal.unbind(-1)
-    sign = torch.where(z < 0.0, -1.0, 1.0)
+    sign = torch.where(z < 0.0, -1.0, 1.0).to(z)
     a = -1.0 / (sign + z)
     b = x * y * a
     rows = [1.0 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y, x, y, z]

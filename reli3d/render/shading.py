@@ -22,6 +22,7 @@ from reli3d._bridge import (
     once_differentiable,
     over_slices,
     present,
+    slice_of_accumulators,
     slices,
     struct_of,
     view,
@@ -175,7 +176,8 @@ class _Shade(torch.autograd.Function):
 
         *tensors, visible = ctx.saved_tensors
         n, device, needed = g_out.shape[0], g_out.device, ctx.needs_input_grad[1:]
-        parts = len(slices(n)) if device.type == "cpu" else 1
+        least = slice_of_accumulators(n, SLICE_MIN, tensors[7].numel() if needed[7] else 0)
+        parts = len(slices(n, least)) if device.type == "cpu" else 1
         # gradients that are not needed have no rows, and the kernel skips them
         g_normal, g_base, g_alpha, g_metallic, texels = (
             torch.zeros_like(tensors[k] if needed[k] else tensors[k][:0]) for k in (1, 4, 5, 6, 7)
@@ -194,7 +196,7 @@ class _Shade(torch.autograd.Function):
 
         if n and ctx.job.count:
             if device.type == "cpu":
-                over_slices(n, work)
+                over_slices(n, work, slice_min=least)
             else:
                 work(0, 0, n)
         grads = [None, g_normal, None, None, g_base, g_alpha, g_metallic, g_radiance.sum(0), None]

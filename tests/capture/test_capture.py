@@ -71,6 +71,7 @@ def test_two_runs_write_equal_files(ground_truth, captured, tmp_path):
     assert all((folder / p).read_bytes() == (tmp_path / "object" / p).read_bytes() for p in files)
 
 
+@pytest.mark.slow
 def test_alpha_of_cut_out_photographs_is_used_as_masks(ground_truth, tmp_path):
     photographs = tmp_path / "photographs"
     photographs.mkdir()

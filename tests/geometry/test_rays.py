@@ -1,5 +1,8 @@
 """Rays against float64 brute force, Embree against Warp, and every input that must not crash."""
 
+import copy
+import gc
+import pickle
 import sys
 import threading
 import weakref
@@ -336,3 +339,13 @@ def test_embree_is_found_in_the_wheel_and_its_absence_is_reported(monkeypatch, t
     monkeypatch.setattr(embreex, "__file__", str(tmp_path / "embreex" / "__init__.py"))
     with pytest.raises(ImportError, match="embreex: expected a wheel with Embree's library, found none"):
         embree._embree.__wrapped__()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_copies_and_pickles_build_their_own_structure(device, backend):
+    scene = make(np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]]), [[0, 1, 2]], backend, device)
+    copies = copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))
+    del scene
+    gc.collect()
+    ray = torch.tensor([0.0, 0.0, 2.0], device=device), torch.tensor([0.0, 0.0, -1.0], device=device)
+    assert [int(c.closest(*ray).face) for c in copies] == [0, 0] and {c.backend for c in copies} == {backend}

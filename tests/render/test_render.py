@@ -189,6 +189,13 @@ def test_rays_that_miss_the_asset_are_skipped_without_effect_on_the_image(device
                 assert torch.equal(getattr(boxed, field.name), getattr(whole, field.name)), (place, cx, field.name)
 
 
+def test_an_asset_without_textures_may_be_out_of_sight(device):
+    asset, env = replace(ball(device), textures=None), Environment(torch.ones(8, 16, 3, device=device))
+    camera = Camera(eye(device, 0.3, 1.0, 4.0), torch.tensor([40.0, 40.0, 900.0, 12.0], device=device), 24, 24)
+    image = render_asset(asset, camera, env)
+    assert not bool(image.alpha.any()) and bool(image.radiance.isfinite().all())
+
+
 def test_image_gradient_reaches_textures_and_light(device):
     asset = ball(device)
     names = "base_color", "roughness", "metallic", "normal"
