@@ -29,7 +29,7 @@ def parser() -> argparse.ArgumentParser:
         help=f"number of seeds, ignored with --held-out; default {COUNT}, with --protocol paper one per --meshes file",
     )
     p.add_argument("--views", type=int, help=f"views per object; default {VIEWS}, fixed by --protocol paper")
-    p.add_argument("--size", type=int, default=192, help="pixels per side of a view")
+    p.add_argument("--size", type=int, default=256, help="pixels per side of a view")
     p.add_argument(
         "--protocol",
         choices=("own", "paper"),

@@ -143,7 +143,7 @@ def synthesize(
     light: Tensor,
     rng: np.random.Generator,
     *,
-    size: int = 192,
+    size: int = 256,
     views: int = 6,
     views_only: bool = False,
     finish_known: bool = True,
