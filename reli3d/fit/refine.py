@@ -178,7 +178,9 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
         fit_shape(unknowns, shape, weights, budget, SHAPE_UNTIL, seed=seed, cameras=options.cameras)
         del shape  # 170 MB of 60 images
         if empty(unknowns.sdf, bound):
-            notes.append("refinement: the masks do not overlap in space, so only maps and lighting are fitted")
+            notes.append(
+                "refinement: the masks do not overlap in space, so only maps and lighting are fitted; run reli3d check"
+            )
         elif budget.counts["shape"]:
             surface = transfer_textures(finished(unknowns.sdf, bound, grid), first, texels)
             images = replace(images, camera=corrected(images.camera, unknowns.pose))

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 from reli3d.fit import refine as fit
 from reli3d.fit import transfer
@@ -13,7 +14,8 @@ from reli3d.fit.choice import PSNR_TOLERANCE_DB, Fitted, Parts
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights, agreement, display_error, hue_drift, palette
 from reli3d.fit.transfer import transfer_textures
-from reli3d.fit.unknowns import Start, Unknowns
+from reli3d.fit.unknowns import Start, Unknowns, corrected
+from reli3d.geometry.camera import project
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
@@ -113,18 +115,29 @@ def test_an_interrupt_gives_the_best_so_far(start, views, monkeypatch):
     assert result.after[0] >= result.before[0] - PSNR_TOLERANCE_DB
 
 
-def test_cameras_that_are_off_move_back(start, views):
-    c2w = views.c2w.clone()
-    c2w[:, :3, 3] += 0.03 * torch.randn(VIEWS, 3, generator=torch.Generator().manual_seed(4))
-    options = fit.RefineOptions(24, cameras=True)
-    result = fit.refine(small_scene.ball(), replace(views, c2w=c2w), steps=45, options=options)
-    off = [(c[:, :3, 3] - views.c2w[:, :3, 3]) for c in (c2w, result.c2w)]
-    # silhouettes of a ball constrain shifts across the view, hardly those along it; the common shift is ambiguous
-    across = [
-        (o - o.mean(0)) - ((o - o.mean(0)) * views.c2w[:, :3, 2]).sum(-1, keepdim=True) * views.c2w[:, :3, 2]
-        for o in off
-    ]
-    assert float(across[1].norm()) < float(across[0].norm())
+def triangulation_residual(c2w, views) -> float:
+    """Mean reprojection error [pixels] of points triangulated with ``c2w`` from their true pixels in ``views``.
+
+    Unlike positions of cameras, it does not change with the frame, and a shift and a rotation that cancel are no error.
+    """
+    points = 0.5 * normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(9)), dim=-1)
+    k = views.intrinsics
+    pixels = project(points[:, None], views.c2w, k)[0]
+    local = torch.cat([(pixels - k[:, 2:]) / k[:, :2] * torch.tensor([1.0, -1.0]), -torch.ones(200, VIEWS, 1)], -1)
+    ray = normalize((c2w[:, :3, :3] @ local[..., None])[..., 0], dim=-1)
+    across = torch.eye(3) - ray[..., :, None] * ray[..., None, :]
+    found = torch.linalg.solve(across.sum(1), (across @ c2w[:, :3, 3:]).sum(1)[..., 0])
+    return float((project(found[:, None], c2w, k)[0] - pixels).norm(dim=-1).mean())
+
+
+def test_cameras_that_are_off_move_back(views):
+    noise = 0.008 * torch.randn(2, VIEWS, 3, generator=torch.Generator().manual_seed(5))  # rad, and of the distance
+    c2w = corrected(views.camera, torch.cat([noise[0], 3.2 * noise[1]], 1)).c2w
+    options, calls = fit.RefineOptions(24, cameras=True), iter(range(50))
+    posed, before_maps = replace(views, c2w=c2w), lambda: next(calls, None) is None
+    result = fit.refine(small_scene.ball(), posed, steps=100, options=options, interrupt=before_maps)
+    # 37 steps of the surface; measured 0.75
+    assert triangulation_residual(result.c2w, views) < 0.82 * triangulation_residual(c2w, views)
 
 
 def test_the_image_border_is_no_contour(views):
