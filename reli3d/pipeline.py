@@ -424,6 +424,11 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     >>> views = reli3d.load_views("photos/shoe", every=True)
     >>> asset = reli3d.refine(reli3d.reconstruct(views.taken()), views, seconds=60)
     """
+    from reli3d.fit.budget import Budget
+
+    expect("asset", asset, Asset)
+    expect("views", views, Views)
+    Budget(seconds, steps)  # raises ValueError
     options = {"light": views.lighting, **options}
     views, options["light"] = _complete_views(views, options["light"])
     batch = views.to(asset.mesh.vertices.device).resampled(REFINED, linear=True)

@@ -90,14 +90,15 @@ class ViewRenderer:
     """Renders one surface in all views at low resolution and compares with the input images; rays are traced once.
 
     received: ``(vertices, 3)``, from :func:`~reli3d.fit.bounce.gathered`.  For V views: ``target (V, S, S, 3)`` display
-    values on white; ``rays``: hit mask ``(S, S)``, faces ``(N,)``, barycentrics ``(N, 2)`` and unit directions to the
-    eye ``(N, 3)``; ``inside (N,)``: whether the hit is at least one pixel inside the mask.
+    values on white; ``photographed (V, S, S)``: of the images; ``rays``: hit mask ``(S, S)``, faces ``(N,)``,
+    barycentrics ``(N, 2)`` and unit directions to the eye ``(N, 3)``; ``inside (N,)``: whether the hit is at least one
+    pixel inside the mask.
     """
 
     @torch.no_grad()
     def __init__(self, asset: Asset, received: Tensor, images: InputImages):
         small = images.resized(min(CHECK_PIXELS, images.size))
-        self.mesh, self.scene = asset.mesh, RayScene(asset.mesh.vertices, asset.mesh.faces)
+        self.scene, self.photographed = RayScene(asset.mesh.vertices, asset.mesh.faces), small.photographed()
         display = linear_to_srgb(small.color.clamp(0.0, 1.0))
         self.target = torch.lerp(torch.ones_like(display), display, small.mask[..., None])
         self.rays, self.inside, inside = [], [], small.inside()
@@ -117,20 +118,20 @@ class ViewRenderer:
         """
         lit = []
         for view, (_, face, bary, wo) in enumerate(self.rays):
-            at = surface_points(self.mesh, asset.textures, face, bary)
-            bounced = reflected(at, interpolate(self.received, self.mesh.faces, face, bary))
+            at = surface_points(asset.mesh, asset.textures, face, bary)
+            bounced = reflected(at, interpolate(self.received, asset.mesh.faces, face, bary))
             light = asset.light if lights is None else lights.of_view(view)
             lit.append((radiance(at, wo, light, samples=CHECK_SAMPLES, scene=self.scene, seed=view), bounced))
         return lit
 
     @torch.no_grad()
     def errors(self, lit: list[tuple[Tensor, Tensor]], light_scale: float = 1.0) -> Tensor:
-        """Mean squared display error ``(V,)`` of whole images on white, with direct light scaled by ``light_scale``."""
-        errors = []
-        for (direct, bounced), (hit, *_), target in zip(lit, self.rays, self.target, strict=True):
+        """Mean squared display error ``(V,)`` of photographed pixels on white, direct light times ``light_scale``."""
+        errors, views = [], zip(lit, self.rays, self.target, self.photographed, strict=True)
+        for (direct, bounced), (hit, *_), target, valid in views:
             image = torch.ones_like(target)
             image[hit] = linear_to_srgb((light_scale * direct + bounced).clamp(0.0, 1.0))
-            errors.append((image - target).square().mean())
+            errors.append((image - target)[valid].square().mean())
         return torch.stack(errors)
 
     @torch.no_grad()

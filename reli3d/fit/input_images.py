@@ -19,7 +19,10 @@ INSIDE_COVERAGE = 0.99  # minimum of a pixel and its neighbors that contain only
 
 
 class PosedImages(Protocol):
-    """Batch of posed images, such as :meth:`reli3d.views.views.Views.resampled` returns."""
+    """Batch of posed images, such as :meth:`reli3d.views.views.Views.resampled` returns.
+
+    It may also have ``silhouettes (V, S, S)``: the masks, continued beyond the border of the photographs.
+    """
 
     @property
     def images(self) -> Tensor:
@@ -48,6 +51,7 @@ class InputImages:
 
     color: ``(V, S, S, 3)`` linear.  mask: ``(V, S, S)`` coverage in [0, 1].  camera: batch of V cameras.  light_group:
     index of the lighting per view, by default 0.  light_moves: whether the lighting is fixed to the camera.
+    silhouette: ``(V, S, S)``, the mask continued beyond the border of the photograph, by default ``mask``.
     """
 
     color: Tensor
@@ -55,8 +59,11 @@ class InputImages:
     camera: Camera
     light_group: tuple[int, ...] = ()
     light_moves: bool = False
+    silhouette: Tensor = None  # type: ignore[assignment] # set after construction
 
     def __post_init__(self):
+        if self.silhouette is None:
+            object.__setattr__(self, "silhouette", self.mask)
         if not self.light_group:
             object.__setattr__(self, "light_group", (0,) * len(self.color))
 
@@ -69,15 +76,19 @@ class InputImages:
         if shapes or devices do not match, or for an invalid ``light``.
         """
         images, masks = views.images, views.masks
+        silhouettes = getattr(views, "silhouettes", None)
+        silhouettes = masks if silhouettes is None else silhouettes
         check("images", images, last=3)
         check("masks", masks, like=images)
+        check("silhouettes", silhouettes, like=images)
         check("c2w", views.c2w, last=4, like=images)
         check("intrinsics", views.intrinsics, last=4, like=images)
         count = len(images)
         if images.ndim != 4 or not count or images.shape[1] != images.shape[2]:
             raise ValueError(f"images: expected (V, S, S, 3) with at least one view, got {tuple(images.shape)}")
-        if masks.shape != images.shape[:3]:
-            raise ValueError(f"masks: expected {tuple(images.shape[:3])}, got {tuple(masks.shape)}")
+        for name, value in (("masks", masks), ("silhouettes", silhouettes)):
+            if value.shape != images.shape[:3]:
+                raise ValueError(f"{name}: expected {tuple(images.shape[:3])}, got {tuple(value.shape)}")
         if views.c2w.shape != (count, 4, 4) or views.intrinsics.shape != (count, 4):
             got = f"{tuple(views.c2w.shape)} and {tuple(views.intrinsics.shape)}"
             raise ValueError(f"c2w, intrinsics: expected {count} cameras, got {got}")
@@ -93,7 +104,7 @@ class InputImages:
         linear = torch.empty_like(images)
         for k, image in enumerate(images.detach()):  # one at a time: less memory
             linear[k] = srgb_to_linear(image)
-        return cls(linear, masks.detach(), camera, group, light == "camera")
+        return cls(linear, masks.detach(), camera, group, light == "camera", silhouettes.detach())
 
     def __len__(self) -> int:
         return len(self.color)
@@ -106,26 +117,33 @@ class InputImages:
     def select(self, views: list[int]) -> InputImages:
         """The images with these indices, in this order."""
         group = tuple(self.light_group[v] for v in views)
-        return InputImages(self.color[views], self.mask[views], self.camera[views], group, self.light_moves)
+        camera, silhouette = self.camera[views], self.silhouette[views]
+        return InputImages(self.color[views], self.mask[views], camera, group, self.light_moves, silhouette)
 
     def resized(self, size: int) -> InputImages:
         """The images resampled to ``size`` pixels per side; colors are averaged with the masks as weights."""
         if size == self.size:
             return self
-        planes = self.color.new_empty(len(self), 4, size, size)
+        planes = self.color.new_empty(len(self), 5, size, size)
         for k, (color, mask) in enumerate(zip(self.color, self.mask, strict=True)):  # one at a time: less memory
-            of_view = torch.cat([color * mask[..., None], mask[..., None]], -1).permute(2, 0, 1)[None]
+            masks = torch.stack([mask, self.silhouette[k]], -1)
+            of_view = torch.cat([color * mask[..., None], masks], -1).permute(2, 0, 1)[None]
             planes[k] = interpolate(of_view, (size, size), mode="bilinear", align_corners=False, antialias=True)[0]
         cover = planes[:, 3]
         color = planes[:, :3].permute(0, 2, 3, 1) / cover.clamp(min=1e-4)[..., None]
         camera = self.camera.resized(size, size)
-        return replace(self, color=color.contiguous(), mask=cover.clamp(0.0, 1.0), camera=camera)
+        mask, silhouette = cover.clamp(0.0, 1.0), planes[:, 4].clamp(0.0, 1.0)
+        return replace(self, color=color.contiguous(), mask=mask, camera=camera, silhouette=silhouette)
 
     def moved(self, shift: Tensor, scale: float) -> InputImages:
         """The images with cameras in the frame ``scale * (x - shift)``."""
         c2w = self.camera.c2w.clone()
         c2w[:, :3, 3] = scale * (c2w[:, :3, 3] - shift)
         return replace(self, camera=replace(self.camera, c2w=c2w))
+
+    def photographed(self) -> Tensor:
+        """``(V, S, S)`` bool: False beyond the border of a photograph where the object may continue."""
+        return (self.silhouette - self.mask).abs() < 1.0 - INSIDE_COVERAGE
 
     def inside(self) -> Tensor:
         """``(V, S, S)`` bool: pixels that contain only the object, as do their 8 neighbors."""

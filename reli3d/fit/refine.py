@@ -18,7 +18,7 @@ from reli3d.fit.input_images import InputImages, PosedImages
 from reli3d.fit.light_frame import light_follows_camera
 from reli3d.fit.light_hue import CHROMATICITY_WEIGHT, with_neutral_light
 from reli3d.fit.maps import FixedSurface, MapsStage, fit_maps
-from reli3d.fit.shape import ShapeData, finished, fit_shape, start_grid
+from reli3d.fit.shape import ShapeData, empty, finished, fit_shape, start_grid
 from reli3d.fit.transfer import transfer_textures
 from reli3d.fit.unknowns import START_GRID, Start, Unknowns, corrected, filled_grid
 from reli3d.geometry.mesh import watertight
@@ -28,7 +28,9 @@ RESOLUTION = 128  # cells along the longest side
 LIGHT = MapsStage("light", until=0.12, detail=False)  # first the lighting, then the surface, then all maps
 SHAPE_UNTIL = 0.5  # fraction of the budget
 MAPS = MapsStage("maps", until=1.0)
+MIN_ATLAS_TEXELS = 256  # along a side of the new surface's textures: smaller ones have no room for its charts
 MAX_DETAIL_TEXELS = 512  # along a side of the base color's detail map
+UV_TOLERANCE = 1e-3  # beyond [0, 1]; within a texel
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ def refine(
 
     The colors of :func:`held_out` views are not fitted.  :func:`~reli3d.fit.choice.chosen` selects what is kept.
     Nothing has gradients.  Raises TypeError or ValueError for mismatched shapes or devices, an invalid ``light`` or
-    budget, or an asset without environment, atlas or faces.
+    budget, or an asset without environment, textures, normals, UV or faces, or open and with UV outside [0, 1].
     """
     images = InputImages.of(views, options.light)
     _check_asset(asset, images)
@@ -125,9 +127,11 @@ def refine(
         budget.bar = progress_bar(seconds or steps or 0, "s" if seconds else "steps")
     held = held_out(len(images))
     used = [v for v in range(len(images)) if v not in held]
-    low, high = asset.mesh.vertices.amin(0), asset.mesh.vertices.amax(0)
+    low, high = asset.mesh.vertices.detach().aminmax(dim=0)
     shift, scale = (low + high) / 2, 2.0 / float((high - low).max())
-    first, near = _moved(asset, shift, scale), images.moved(shift, scale)
+    first, near = _moved(asset.detach(), shift, scale), images.moved(shift, scale)
+    if first.mesh.tangents is None:
+        first = replace(first, mesh=first.mesh.with_tangents())
     received = gathered(first.mesh, near.select(used), seed=options.seed)
     before = view_errors(first, received, near)
     first = with_neutral_light(first, options.light_chromaticity)
@@ -161,23 +165,27 @@ def refine(
 
 def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: list[str]) -> Fitted:
     first, images, used, seed = data.asset, data.images, data.used, options.seed
-    start, weights, texels = data.start, options.weights, min(MAX_DETAIL_TEXELS, first.textures.size)
+    start, weights, texels = data.start, options.weights, max(MIN_ATLAS_TEXELS, first.textures.size)
     closed = watertight(first.mesh)
     sdf = first.mesh.vertices.new_ones(2, 2, 2)  # unused placeholder: an open surface has no signed distance
     if closed:
         grid, sdf, bound = start_grid(first.mesh, images, options.resolution)
-    unknowns = Unknowns.zero(sdf, len(images), texels, max(images.light_group) + 1)
+    unknowns = Unknowns.zero(sdf, len(images), min(MAX_DETAIL_TEXELS, texels), max(images.light_group) + 1)
     fit_maps(unknowns, data, weights, budget, LIGHT, seed=seed)
     if closed:
         around = filled_grid(first.mesh.vertices, data.received, START_GRID)
         shape = ShapeData.of(start, sdf, bound, grid, around, images, used)
         fit_shape(unknowns, shape, weights, budget, SHAPE_UNTIL, seed=seed, cameras=options.cameras)
         del shape  # 170 MB of 60 images
-        mesh = finished(unknowns.sdf, bound, grid)
-        surface = transfer_textures(mesh, first, first.textures.size)
-        images = replace(images, camera=corrected(images.camera, unknowns.pose))
-        received = gathered(surface.mesh, images.select(used), seed=seed)
-        data = FixedSurface(start, surface, received, images, used)
+        if empty(unknowns.sdf, bound):
+            notes.append(
+                "refinement: the masks do not overlap in space, so only maps and lighting are fitted; run reli3d check"
+            )
+        elif budget.counts["shape"]:
+            surface = transfer_textures(finished(unknowns.sdf, bound, grid), first, texels)
+            images = replace(images, camera=corrected(images.camera, unknowns.pose))
+            received = gathered(surface.mesh, images.select(used), seed=seed)
+            data = FixedSurface(start, surface, received, images, used)
     else:
         notes.append("refinement: the surface is not closed, so only maps and lighting are fitted")
     fit_maps(unknowns, data, weights, budget, MAPS, seed=seed)
@@ -187,8 +195,14 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
 def _check_asset(asset: Asset, images: InputImages) -> None:
     if asset.environment is None:
         raise ValueError("asset.environment: expected an environment to start from, got None")
-    if asset.mesh.uv is None or asset.mesh.normals is None or asset.mesh.tangents is None or not len(asset.mesh.faces):
-        raise ValueError("asset.mesh: expected faces with normals, uv and tangents, got none")
+    if asset.textures is None:
+        raise ValueError("asset.textures: expected textures to start from, got None")
+    if asset.mesh.uv is None or asset.mesh.normals is None or not len(asset.mesh.faces):
+        raise ValueError("asset.mesh: expected faces with normals and uv, got none; see reli3d.unwrap")
+    low, high = (float(v) for v in asset.mesh.uv.detach().aminmax())
+    if (low < -UV_TOLERANCE or high > 1.0 + UV_TOLERANCE) and not watertight(asset.mesh):
+        got = f"[{low:.3g}, {high:.3g}]; see reli3d.unwrap"
+        raise ValueError(f"asset.mesh.uv: expected values in [0, 1] on an open surface, got {got}")
     if asset.mesh.vertices.device != images.color.device:
         raise ValueError(f"views: expected device {asset.mesh.vertices.device}, got {images.color.device}")
 

@@ -20,6 +20,7 @@ from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.points import SurfacePoints
 
+TEXELS_PER_CHUNK = 1 << 18
 MAX_SURFACE_DISTANCE = 0.04  # of the surfaces along the new one's normal, of the longest side
 
 
@@ -64,7 +65,7 @@ def transfer_textures(mesh: Mesh, source: Asset, size: int, *, shape: bool = Fal
         return _maps(replace(old, normal=unit(normal + bump)), normal, tangent)
 
     factor = max(1, source.textures.size // size)  # smaller textures are averages
-    baked = bake(mesh, factor * size, at_texels, tangents=True, chunk=size * size)
+    baked = bake(mesh, factor * size, at_texels, tangents=True)
     return Asset(mesh, _textures({name: _means(v, factor) for name, v in baked.items()}), source.environment)
 
 
@@ -76,25 +77,26 @@ def _means(values: Tensor, factor: int) -> Tensor:
 
 
 def changed(asset: Asset, unknowns: Unknowns) -> Asset:
-    """``asset`` with the changes of material and shading normals baked into its textures."""
+    """``asset`` with its vertex colors and the changes of material and normals baked into its textures."""
     size = asset.textures.size
     texels = rasterize_texels(asset.mesh, size)
-    index = torch.nonzero(texels.valid.reshape(-1))[:, 0]
-    found = texels.face.reshape(-1)[index], texels.bary.reshape(-1, 2)[index]
-    row, column = torch.div(index, size, rounding_mode="floor"), index % size
-    uv = (torch.stack([column, row], -1).float() + 0.5) / size
+    parts = iter(torch.nonzero(texels.valid.reshape(-1))[:, 0].split(TEXELS_PER_CHUNK))  # of one call each
 
     def at_texels(position: Tensor, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:
-        old = surface_points(asset.mesh, asset.textures, *found)
+        index = next(parts)
+        row, column = torch.div(index, size, rounding_mode="floor"), index % size
+        uv = (torch.stack([column, row], -1).float() + 0.5) / size
+        old = surface_points(
+            asset.mesh, asset.textures, texels.face.reshape(-1)[index], texels.bary.reshape(-1, 2)[index]
+        )
         logits = material_logits(old) + material_change(unknowns, position)
         logits[:, :3] += sample_texture(unknowns.detail, uv)
         color, roughness, metallic = material_of(logits)
         world, _ = bent(unknowns, position, old.normal)
         return _maps(SurfacePoints(position, old.ng, world, color, roughness, metallic), normal, tangent)
 
-    # one chunk: ``found`` and ``uv`` are those of all texels
-    baked = bake(asset.mesh, size, at_texels, texels=texels, tangents=True, chunk=size * size)
-    return replace(asset, textures=_textures(baked))
+    baked = bake(asset.mesh, size, at_texels, texels=texels, tangents=True, chunk=TEXELS_PER_CHUNK)
+    return replace(asset, mesh=replace(asset.mesh, colors=None), textures=_textures(baked))
 
 
 def _maps(at: SurfacePoints, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:

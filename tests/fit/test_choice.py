@@ -7,10 +7,12 @@ import torch
 
 from reli3d.fit.choice import Fitted, Parts, ViewRenderer, chosen, view_errors
 from reli3d.fit.input_images import InputImages
+from reli3d.fit.transfer import changed
 from reli3d.fit.unknowns import LIGHT_ROWS, Start, Unknowns
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
+from reli3d.views.views import Views
 from tests.support import small_scene
 
 VIEWS, USED, HELD = 5, [0, 1, 3, 4], [2]
@@ -117,6 +119,24 @@ def test_a_fit_that_improves_only_input_views_is_not_kept(true, images):
     before[HELD] = 1e-8  # nothing is as good as that
     assert chosen(fit, USED, HELD, before)[0] is first
     assert chosen(fit, USED, [], before)[1].light == 1.0
+
+
+def test_errors_ignore_what_is_beyond_a_photograph(true):
+    views = small_scene.input_views(true, VIEWS, 48)
+    images, masks = (tuple(v[:, :34] for v in values) for values in (views.images, views.masks))
+    cut = Views(images, masks, views.c2w, views.intrinsics, tuple("abcde")).resampled(48, linear=True)
+    errors = error_of(true, InputImages.of(cut)) / error_of(true, InputImages.of(views))
+    assert float(errors.max()) < 4.0  # resampled again and enlarged
+
+
+def test_vertex_colors_are_baked_once(true, images):
+    colors = 0.5 + 0.4 * true.mesh.vertices
+    first = replace(true, mesh=replace(true.mesh, colors=colors))
+    renderer = ViewRenderer(first, torch.zeros_like(colors), images)
+    baked = changed(first, Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS))
+    errors = [renderer.errors(renderer.lit(asset)) for asset in (first, baked)]
+    torch.testing.assert_close(*errors, rtol=0.02, atol=0.0)  # texels blend at the rims of charts
+    torch.testing.assert_close(error_of(baked, images), errors[1])
 
 
 def test_renderings_include_interreflection_and_the_scale_applies_to_direct_light(true, images):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from torch.nn.functional import normalize
+from torch.overrides import TorchFunctionMode
 
 from reli3d.fit import maps
 from reli3d.fit.bounce import gathered
@@ -156,6 +157,28 @@ def test_light_that_moves_with_the_camera_is_detected():
     assert fixed[0] < 0.05 and not light_follows_camera(mesh, shaded(False))
     exposure = torch.linspace(0.4, 1.0, 16)[:, None, None, None]  # is a constant of each view
     assert explained_deviations(mesh, shaded(False, exposure))[0] == pytest.approx(fixed[0], abs=0.03)
+
+
+class LargestResult(TorchFunctionMode):
+    """Elements of the largest tensor that a function of torch returns."""
+
+    elements = 0
+
+    def __torch_function__(self, function, types, args=(), kwargs=None):
+        result = function(*args, **(kwargs or {}))
+        if isinstance(result, torch.Tensor):
+            self.elements = max(self.elements, result.numel())
+        return result
+
+
+@pytest.mark.parametrize("count, cells", [(130, 24), (12, 50)])
+def test_the_light_is_compared_at_a_limited_number_of_points_and_views(count, cells):
+    mesh = small_scene.ball(cells=cells).mesh
+    images = shaded(True).resized(12).select([k % 16 for k in range(count)])
+    with LargestResult() as largest:
+        light_follows_camera(mesh, images)
+    points, views = min(len(mesh.vertices), 4096), min(count, 64)
+    assert largest.elements <= points * views * (views + 9)  # of the rows of the linear fit
 
 
 def test_light_that_moves_with_the_camera_is_reported():

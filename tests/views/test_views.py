@@ -1,5 +1,4 @@
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -7,9 +6,11 @@ import torch
 from reli3d.geometry.camera import project
 from reli3d.geometry.hull import mask_distance
 from reli3d.pipeline import refine
+from reli3d.render.asset import Asset
 from reli3d.render.color import srgb_to_linear
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import MASK_EDGE, Views, mask_box
+from tests.support import small_scene
 from tests.support.rigs import sphere_views
 
 
@@ -134,11 +135,23 @@ def test_cut_off_views_are_left_out_of_a_refinement_while_three_remain(monkeypat
     monkeypatch.setattr(
         "reli3d.pipeline._refined", lambda asset, batch, **given: fitted.append((batch, given)) or asset
     )
-    asset = SimpleNamespace(mesh=SimpleNamespace(vertices=torch.zeros(1, 3)), asset=None)
+    asset = small_scene.ball()
+    monkeypatch.setattr(Asset, "asset", None, raising=False)  # of the result
     refine(asset, replace(views, masks=cut_off), steps=1, light=list(range(9)))
     refine(asset, replace(views, masks=cut_off).select(3), steps=1)  # two others
     assert [len(batch) for batch, _ in fitted] == [8, 3] and fitted[0][1]["light"] == list(range(1, 9))
     assert torch.equal(fitted[0][0].c2w, views.c2w[1:]) and torch.equal(fitted[1][0].c2w, views.c2w[:3])
+
+
+def test_wrong_arguments_of_a_refinement_are_refused_before_images_are_resampled(monkeypatch):
+    views, asset = sphere_views(count=3, size=(64, 64)), small_scene.ball()
+    monkeypatch.delattr(Views, "resampled")
+    with pytest.raises(TypeError, match="asset: expected Asset, got list"):
+        refine([asset], views, steps=1)
+    with pytest.raises(TypeError, match="views: expected Views, got ViewBatch"):
+        refine(asset, small_scene.input_views(asset, 3, 16), steps=1)
+    with pytest.raises(ValueError, match="seconds, steps: expected one of the two"):
+        refine(asset, views)
 
 
 def test_linear_averages_are_those_of_light():
