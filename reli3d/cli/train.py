@@ -264,7 +264,7 @@ def export(args: argparse.Namespace, stage: "Stage") -> "LocalReconstructor | Re
     if isinstance(model, LocalReconstructor):
         samples = args.validation if "validation" in args else args.data[0]
         if "validation" not in args:
-            report("surface offsets are chosen on training samples, where the network is too certain; give --validation")
+            report("surface offsets chosen on training samples, where the network is too certain; give --validation")
         for views, tried in calibrate(model, samples, progress=report).items():
             row = ", ".join(f"{offset:g}: {iou:.4f}" for offset, iou in tried.items())
             report(f"silhouette IoU by surface offset, {views} views: {row}")
