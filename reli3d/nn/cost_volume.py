@@ -20,6 +20,7 @@ NEIGHBORS = 5  # views that a pixel is compared with, those of the closest direc
 PAIR_WIDTH, POOLED_WIDTH, CONV_WIDTH = 16, 8, 8  # widths of the layers on pairs, of their mean, of the 3D convolutions
 PAIR_FEATURES, OWN_FEATURES = 5, 5  # of a hypothesis in another view, and in its own
 NEAR_DISTANCE, FAR_DISTANCE = 0.05, 0.2  # scales of distances along a ray, world units
+MIN_SPREAD = 1e-3  # standard deviation where one hypothesis is certain, so that its gradient is finite
 
 
 class CostVolume(nn.Module):
@@ -44,6 +45,7 @@ class CostVolume(nn.Module):
             last,
         )
         self.prior = nn.Parameter(-torch.tensor(OFFSETS).abs() / PRIOR_DECAY)
+        self.widening = nn.Parameter(torch.zeros(()))  # of the evidence of uncertain depths, see ahead_of_surface
 
     def forward(
         self,
@@ -54,13 +56,15 @@ class CostVolume(nn.Module):
         span: Tensor,
         camera: Camera,
         coverage: Tensor,
-    ) -> Tensor:
-        """Depth ``(V, Q, Q)`` relative to the world origin's, of ``V`` > 1 views; ``depth`` where nothing is covered.
+    ) -> tuple[Tensor, Tensor]:
+        """Depth ``(V, Q, Q)`` relative to the world origin's, of ``V`` > 1 views, and its standard deviation.
+
+        Where nothing is covered they are ``depth`` and 0.
 
         features: ``(V, Q, Q, F)``.  color: ``(V, Q, Q, 3)`` sRGB.  depth, normal: ``(V, Q, Q)`` and ``(V, Q, Q, 3)``,
         predicted per view.  span: ``(V, Q, Q, 2)`` from :func:`~reli3d.nn.pyramid.pixel_hull_depths`.  camera: of
         ``Q`` by ``Q`` pixels.  coverage: ``(V, Q, Q)``.  Gradients reach features, color, depth, normal and
-        every parameter but the last bias, which has no effect.
+        every parameter but the last bias, which has no effect, and ``widening``, which is read elsewhere.
         """
         match = self.match(torch.cat([features, color], -1).permute(0, 3, 1, 2)).unflatten(1, (GROUPS, -1))
         match = functional.normalize(match, dim=2).flatten(1, 2).permute(0, 2, 3, 1)
@@ -76,8 +80,11 @@ class CostVolume(nn.Module):
             for view, others in enumerate(order[:, :-1][:, :NEIGHBORS].tolist())
         ]
         volume = torch.stack(dense).permute(0, 4, 3, 1, 2).contiguous(memory_format=torch.channels_last_3d)
-        score = self.regular(volume)[:, 0].permute(0, 2, 3, 1) + self.prior
-        return depth + (score.softmax(-1) * score.new_tensor(OFFSETS)).sum(-1) * valid
+        probability = (self.regular(volume)[:, 0].permute(0, 2, 3, 1) + self.prior).softmax(-1)
+        offsets = probability.new_tensor(OFFSETS)
+        mean = (probability * offsets).sum(-1)
+        variance = (probability * (offsets - mean[..., None]).square()).sum(-1)
+        return depth + mean * valid, (variance + MIN_SPREAD**2).sqrt() * valid
 
     def _hypothesis_features(
         self, view: int, others: list[int], maps: Tensor, shape: Tensor, camera: Camera, valid: Tensor

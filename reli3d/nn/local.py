@@ -69,6 +69,7 @@ class PixelMaps:
     chroma: Tensor  # (V, P, P, 1) gain of the color logits minus their mean
     normal: Tensor  # (V, P, P, 3) world, unit
     depth: Tensor  # (V, P, P, 1) along the camera axis, relative to the world origin's
+    spread: Tensor  # (V, P, P, 1) standard deviation of depth, 0 before the cost volume
 
     def of_views(self, count: int) -> PixelMaps:
         """The maps of the first ``count`` views."""
@@ -91,10 +92,11 @@ class PixelMaps:
         span = functional.interpolate(span.permute(0, 3, 1, 2), size=size, mode="nearest").permute(0, 2, 3, 1)
         depth = torch.lerp(span[..., :1], span[..., 1:], (depth - 1.0).sigmoid())  # inside the hull
         gain, chroma = (gain + 2.0).sigmoid(), 2.0 * chroma.sigmoid()
-        return PixelMaps(gain, shift - gain * mean, confidence, rough, metal + METALLIC_LOGIT, chroma, world, depth)
+        color = gain, shift - gain * mean, confidence
+        return PixelMaps(*color, rough, metal + METALLIC_LOGIT, chroma, world, depth, torch.zeros_like(depth))
 
     def stacked(self) -> Tensor:
-        """All maps but depth, ``(V, P, P, 11)``."""
+        """All maps but depth and its spread, ``(V, P, P, 11)``."""
         material = [self.gain, self.shift, self.confidence, self.roughness, self.metallic, self.chroma]
         return torch.cat([*material, self.normal], -1)
 
@@ -210,12 +212,17 @@ class LocalReconstructor(nn.Module):
         shape = functional.avg_pool2d(shape, camera.height // features.shape[1]).permute(0, 2, 3, 1)
         tokens = torch.cat([features, shape], -1).contiguous()
         maps = ViewMaps(tokens, detail, Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1]), mirrored)
-        surface = torch.cat([pixels.depth * mask, mask], -1)
-        volume = self.volume(maps, surface)
+        surface = torch.cat([pixels.depth * mask, pixels.spread * mask, mask], -1)
+        volume = self.volume(maps, surface, self.widening)
         lit = mask[..., 0].clone()
         lit[maps.input_count :] = 0.0
         log_light = self._light(pixels, color, lit, camera)
         return LocalField(maps, self, pixels, color, surface, volume, log_light, inference=inference)
+
+    @property
+    def widening(self) -> Tensor | float:
+        """Effect of uncertain depths, see :func:`~reli3d.nn.view_features.ahead_of_surface`."""
+        return 0.0 if self.cost_volume is None else self.cost_volume.widening
 
     def read_pixels(
         self,
@@ -249,12 +256,13 @@ class LocalReconstructor(nn.Module):
             features, raw = torch.cat([features, features[:mirrored].flip(2)]), torch.cat([raw, turned])
         pixels = PixelMaps.of(raw, span, coarse, mean)
         if self.cost_volume is not None and taken > 1:
-            depth = _refined_depth(
+            depth, spread = _refined_depth(
                 self.cost_volume, pixels.of_views(taken), features[:taken], images, masks, span[:taken], read
             )
             if mirrored:
                 depth = torch.cat([depth, depth[:mirrored].flip(2) + nearer[:, None, None, None]])
-            pixels = replace(pixels, depth=depth)
+                spread = torch.cat([spread, spread[:mirrored].flip(2)])
+            pixels = replace(pixels, depth=depth, spread=spread)
         return features, pixels, coarse
 
     def _light(self, pixels: PixelMaps, color: Tensor, mask: Tensor, camera: Camera) -> Tensor:
@@ -271,18 +279,22 @@ class LocalReconstructor(nn.Module):
 
 def _refined_depth(
     volume: CostVolume, pixels: PixelMaps, features: Tensor, images: Tensor, masks: Tensor, span: Tensor, camera: Camera
-) -> Tensor:
-    """Depth of ``pixels`` plus the correction by ``volume``, upsampled bilinearly from half their resolution."""
+) -> tuple[Tensor, Tensor]:
+    """Depth of ``pixels`` plus the correction by ``volume``, and its standard deviation, ``(V, P, P, 1)``.
+
+    Correction and deviation are upsampled bilinearly from half the resolution.
+    """
     count = len(features)
     quarter = camera.resized(features.shape[2], features.shape[1])
     color, coverage = pixel_colors(images[:count], masks[:count], quarter)
     shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
     shape = functional.avg_pool2d(shape, shape.shape[-1] // features.shape[2]).permute(0, 2, 3, 1)
     depth, normal = shape[..., 0], functional.normalize(shape[..., 1:], dim=-1)
-    found = volume(features, color, depth, normal, span, quarter, coverage[..., 0])
-    change = torch.stack([found - depth, (coverage[..., 0] > MIN_COVERAGE).to(depth)], 1)
+    found, spread = volume(features, color, depth, normal, span, quarter, coverage[..., 0])
+    change = torch.stack([found - depth, spread, (coverage[..., 0] > MIN_COVERAGE).to(depth)], 1)
     change = functional.interpolate(change, size=pixels.depth.shape[1:3], mode="bilinear", align_corners=False)
-    return pixels.depth + (change[:, 0] / change[:, 1].clamp(min=MIN_INTERPOLATION_WEIGHT))[..., None]
+    offset, spread = (change[:, :2] / change[:, 2:].clamp(min=MIN_INTERPOLATION_WEIGHT))[..., None].unbind(1)
+    return pixels.depth + offset, spread
 
 
 def pixel_colors(images: Tensor, masks: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -301,7 +313,7 @@ class LocalField:
     model: LocalReconstructor
     pixels: PixelMaps
     color: Tensor  # (V, P, P, 3) sRGB, observed
-    surface: Tensor  # (V, P, P, 2) predicted depth times coverage, and coverage
+    surface: Tensor  # (V, P, P, 3) predicted depth and its standard deviation, times coverage, and coverage
     volume: Tensor  # (N, N, N, F)
     log_light: Tensor  # (3, H, 2H)
     shading: Shading | None = None
@@ -355,7 +367,7 @@ class LocalField:
         of_views, _ = views(maps, points, None if visible is None else visible[:, : maps.input_count], normal)
         of_space = model.volume.sample(self.volume, points)
         rest = [(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(self.maps.images))]
-        ahead = ahead_of_surface(self.surface[: maps.input_count], maps, points)
+        ahead = ahead_of_surface(self.surface[: maps.input_count], maps, points, model.widening)
         return torch.cat([of_space, of_views, torch.stack(rest, -1), ahead], -1)
 
     def fused(self, position: Tensor, normal: Tensor, visible: Tensor) -> Fused:

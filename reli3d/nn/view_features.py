@@ -97,21 +97,25 @@ AHEAD = 4  # width of ahead_of_surface
 NEAR_DISTANCE, FAR_DISTANCE = 0.05, 0.2  # scales of its distances, world units
 
 
-def ahead_of_surface(surface: Tensor, maps: ViewMaps, points: Tensor) -> Tensor:
+def ahead_of_surface(surface: Tensor, maps: ViewMaps, points: Tensor, widening: Tensor | float = 0.0) -> Tensor:
     """Signed distances of ``points (N, 3)`` in front of the surfaces predicted in the views, ``(N, AHEAD)``.
 
-    surface: ``(V, P, P, 2)``, pixel depth relative to the world origin's along the camera axis times coverage, and
-    coverage.  Over the views that cover the point: maximum and mean of tanh(distance / NEAR_DISTANCE), mean of
-    tanh(distance / FAR_DISTANCE), and the fraction of such views.  Space in front of a visible surface is empty; far
-    behind it a view has no information.  Gradients reach ``surface``.
+    surface: ``(V, P, P, 3)``, pixel depth relative to the world origin's along the camera axis, its standard deviation
+    ``s``, both times coverage, and coverage.  Over the views that cover the point: maximum and mean of tanh(distance /
+    near), mean of tanh(distance / far), and the fraction of such views; near and far are the roots of
+    ``NEAR_DISTANCE**2 + widening * s**2`` and ``FAR_DISTANCE**2 + widening * s**2``, so that an uncertain depth counts
+    less.  Space in front of a visible surface is empty; far behind it a view has no information.  Gradients reach
+    ``surface`` and ``widening``.
     """
     got, pixel = gather_views(surface, points, maps.camera)
-    covered = got[..., 1].clamp(min=0.1)
+    covered = got[..., 2].clamp(min=0.1)
     c2w = maps.camera.c2w
     origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)
     ahead = got[..., 0] / covered - (pixel[..., 2] - origin)
-    shown = (got[..., 1] > 0.5).to(ahead)
-    near, far = (ahead / NEAR_DISTANCE).tanh() * shown, (ahead / FAR_DISTANCE).tanh() * shown
+    shown = (got[..., 2] > 0.5).to(ahead)
+    wider = widening * (got[..., 1] / covered).square()
+    scales = [(scale**2 + wider).clamp(min=scale**2 / 4).sqrt() for scale in (NEAR_DISTANCE, FAR_DISTANCE)]
+    near, far = ((ahead / scale).tanh() * shown for scale in scales)
     fraction = shown.mean(1)
     few = fraction.clamp(min=0.5 / len(c2w))
     greatest = (near - 2.0 * (1.0 - shown)).amax(1).clamp(min=-1.0)

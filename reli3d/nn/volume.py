@@ -45,16 +45,17 @@ class FeatureVolume(nn.Module):
         self.out = nn.Conv3d(widths[0], sizes.features, 1)
         self.side, self.radius = sizes.side, sizes.radius
 
-    def forward(self, maps: ViewMaps, surface: Tensor) -> Tensor:
+    def forward(self, maps: ViewMaps, surface: Tensor, widening: Tensor | float = 0.0) -> Tensor:
         """Features ``(N, N, N, F)``, indexed x, y, z; grid points far outside the visual hull enter as zeros.
 
-        surface: as in :func:`~reli3d.nn.view_features.ahead_of_surface`.  Gradients reach the tokens, the surface and
-        every parameter.
+        surface, widening: as in :func:`~reli3d.nn.view_features.ahead_of_surface`.  Gradients reach the tokens, the
+        surface, ``widening`` and every parameter.
         """
         axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device, dtype=torch.float32)
         hull = hull_grid(axis, maps.silhouette, maps.camera, far=NEAR_HULL).view(-1)
         near = (hull > -NEAR_HULL).nonzero()[:, 0]
-        reduced = self._reduced(maps, surface, torch.cartesian_prod(axis, axis, axis)[near], hull[near])
+        points = torch.cartesian_prod(axis, axis, axis)[near]
+        reduced = self._reduced(maps, points, hull[near], ahead_of_surface(surface, maps, points, widening))
         x = reduced.new_zeros(self.side**3, reduced.shape[1]).index_copy(0, near, reduced)
         x = x.reshape(1, self.side, self.side, self.side, -1).permute(0, 4, 1, 2, 3)  # channels last: half the time
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):
@@ -72,7 +73,7 @@ class FeatureVolume(nn.Module):
             x = up(finer + coarse)
         return self.out(x)
 
-    def _reduced(self, maps: ViewMaps, surface: Tensor, points: Tensor, hull: Tensor) -> Tensor:
+    def _reduced(self, maps: ViewMaps, points: Tensor, hull: Tensor, ahead: Tensor) -> Tensor:
         """Features of ``points (N, 3)``: weighted mean and variance of two layers over the views, and numbers."""
         gathered, _ = gather_views(maps.tokens, points, maps.camera)
         numbers, weight, summary = summarize_views(maps.images, maps.camera, points, None, None)
@@ -80,7 +81,7 @@ class FeatureVolume(nn.Module):
         mean = (mixed * weight[..., None]).sum(1)
         variance = ((mixed - mean[:, None]).square() * weight[..., None]).sum(1)
         rest = torch.stack([(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(maps.images))], -1)
-        return self.reduce(torch.cat([mean, variance, summary, rest, ahead_of_surface(surface, maps, points)], -1))
+        return self.reduce(torch.cat([mean, variance, summary, rest, ahead], -1))
 
     def sample(self, volume: Tensor, points: Tensor) -> Tensor:
         """Trilinear interpolation ``(N, F)`` of ``volume`` at ``points (N, 3)``, clamped to the border."""

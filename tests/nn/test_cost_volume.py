@@ -59,10 +59,14 @@ def model() -> CostVolume:
     return volume
 
 
-def found(model: CostVolume, views: dict, predicted: Tensor) -> Tensor:
+def distribution(model: CostVolume, views: dict, predicted: Tensor) -> tuple[Tensor, Tensor]:
     features, span = torch.zeros(*predicted.shape, 4), torch.tensor([-0.5, 0.5]).expand(*predicted.shape, 2)
     args = (features, views["color"], predicted, views["normal"], span, views["camera"], views["seen"])
     return model(*args)
+
+
+def found(model: CostVolume, views: dict, predicted: Tensor) -> Tensor:
+    return distribution(model, views, predicted)[0]
 
 
 def inner(views: dict) -> Tensor:
@@ -78,6 +82,20 @@ def test_a_wrong_depth_of_a_textured_sphere_is_corrected(model, error):
     left = (got - views["truth"]).abs()[inner(views)]
     assert error in OFFSETS  # a hypothesis is true
     assert float(left.median()) < 0.02  # width of a pixel
+
+
+def test_the_standard_deviation_is_small_where_texture_shows_the_depth(model):
+    views = sphere_views(5)
+    gray = {**views, "color": torch.full_like(views["color"], 0.5)}
+    with torch.no_grad():
+        (_, sure), (_, unsure) = (distribution(model, v, v["truth"]) for v in (views, gray))
+        _, initial = distribution(CostVolume(4), views, views["truth"])
+    assert float(sure[inner(views)].median()) < 0.02  # width of a pixel
+    assert float(unsure[inner(views)].median()) > 0.06
+    weight = (-torch.tensor(OFFSETS).abs() / 0.06).softmax(0)
+    expected = (weight * torch.tensor(OFFSETS).square()).sum().sqrt()
+    torch.testing.assert_close(initial[inner(views)].mean(), expected, rtol=1e-3, atol=0)
+    assert (sure[views["seen"] == 0] == 0).all()
 
 
 @pytest.fixture
@@ -129,5 +147,5 @@ def test_gradients_reach_inputs_and_parameters(random_model):
             values.append(float(loss(views)))
     # a central difference of a float32 sum over some thousand pixels
     assert float(weight.grad[index]) == pytest.approx((values[0] - values[1]) / (2 * step), rel=0.05)
-    without = {id(model.regular[4].bias)}  # it shifts all scores
+    without = {id(model.regular[4].bias), id(model.widening)}  # the bias shifts all scores
     assert all(t.grad.abs().sum() > 0 for t in (*inputs.values(), *model.parameters()) if id(t) not in without)

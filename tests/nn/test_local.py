@@ -347,8 +347,8 @@ def test_points_know_whether_they_lie_before_a_surface():
     c2w = look_at(torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0]]), torch.zeros(2, 3), torch.tensor([0.0, 1.0, 0.0]))
     intrinsics = torch.tensor([[SIZE * 1.2, SIZE * 1.2, SIZE / 2, SIZE / 2]]).expand(2, 4).contiguous()
     maps = ViewMaps(torch.zeros(2, 16, 16, 8), torch.zeros(2, SIZE, SIZE, 4), Camera(c2w, intrinsics, SIZE, SIZE))
-    surface = torch.zeros(2, 32, 32, 2)
-    surface[0, ..., 1] = 1.0  # the second camera shows nothing
+    surface = torch.zeros(2, 32, 32, 3)
+    surface[0, ..., 2] = 1.0  # the second camera shows nothing
     surface.requires_grad_()
     points = torch.tensor([[0.0, 0.0, 0.03], [0.1, 0.0, -0.03], [0.1, 0.1, 0.5]])
     got = ahead_of_surface(surface, maps, points)
@@ -358,7 +358,15 @@ def test_points_know_whether_they_lie_before_a_surface():
     assert torch.equal(got[:, 3], torch.full((3,), 0.5))
     got[0, 0].backward()
     assert float(surface.grad[0, ..., 0].sum()) > 0 and float(surface.grad[1].abs().max()) == 0.0
-    assert torch.equal(ahead_of_surface(torch.zeros(2, 32, 32, 2), maps, points)[:, 1:], torch.zeros(3, 3))
+    assert torch.equal(ahead_of_surface(torch.zeros(2, 32, 32, 3), maps, points)[:, 1:], torch.zeros(3, 3))
+    uncertain, widening = surface.detach().clone(), torch.tensor(4.0, requires_grad=True)
+    uncertain[0, ..., 1] = 0.06  # near = sqrt(0.05^2 + 4 * 0.06^2) = 0.13, far = sqrt(0.2^2 + 4 * 0.06^2)
+    got = ahead_of_surface(uncertain, maps, points, widening)
+    for column, scale in ((1, 0.13), (2, 0.05440**0.5)):
+        expected = (torch.tensor([0.03, -0.03, 0.5]) / scale).tanh()
+        torch.testing.assert_close(got[:, column], expected, rtol=0, atol=1e-4)
+    got[0, 0].backward()
+    assert float(widening.grad) < 0
 
 
 @torch.no_grad()
