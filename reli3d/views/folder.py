@@ -73,10 +73,8 @@ def load_views(
         raise InputError(masks, "masks: expected a folder of mask images, got none; check the path")
     frames, notes = _read_cameras(root)
     index = FolderIndex()
-    frames = [
-        replace(f, **{k: _existing(root, p, index) or p for k in ("image", "mask") if (p := getattr(f, k))})
-        for f in frames
-    ]
+    frames = [replace(f, image=_existing(root, f.image, index) or f.image) for f in frames]
+    frames = [replace(f, mask=f.mask and _existing(root, f.mask, index) or f.mask) for f in frames]
     _check_poses(frames)
     files = MaskFiles(root, frames, None if masks is None else Path(masks))
     offered, names = len(frames), [frame.name for frame in frames]
