@@ -359,12 +359,12 @@ def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[s
                 f"{value:.6g}; "
                 "give pixels of the stored image",
             )
+    note = check_distortion(where, lens, fx, (max(cx, width - cx), max(cy, height - cy)))
+    notes.extend([note] if note else [])
     if min(fx / width, fy / height) < 0.05 or max(fx / width, fy / height) > 1000:
         raise InputError(
             where,
             f"focal length: expected 0.05 to 1000 image sides, got {fx:.6g} pixels for {width}; "
             "give pixels (or radians for an angle)",
         )
-    note = check_distortion(where, lens, fx, (max(cx, width - cx), max(cy, height - cy)))
-    notes.extend([note] if note else [])
     return [fx, fy, cx, cy]
