@@ -126,12 +126,13 @@ def load_views(
 
 def _grouped(notes: list[tuple[Frame, str]], total: int) -> list[str]:
     """One of those notes that differ only in the frame, with their number."""
-    groups: dict[str, list[str]] = {}
+    groups: dict[str, dict[str, str]] = {}
     for frame, note in notes:
         text = note.removeprefix(frame.where)
         text = text.partition(": ")[2] if text.startswith(frame.image.stem) else text
-        groups.setdefault(text, []).append(note)
-    return [g[0] if len(g) == 1 else f"{g[0]}; {len(g)} of {total} such images" for g in groups.values()]
+        groups.setdefault(text, {}).setdefault(frame.name, note)  # a mask often has the note of its image
+    first = [(next(iter(group.values())), len(group)) for group in groups.values()]
+    return [note if count == 1 else f"{note}; {count} of {total} such images" for note, count in first]
 
 
 def _read_cameras(root: Path) -> tuple[list[Frame], list[str]]:

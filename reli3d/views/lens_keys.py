@@ -42,7 +42,7 @@ _FOCALS = (("fl_x", "fl_y"), ("fx", "fy"))
 _ANGLES = (("x_fov", "y_fov", math.pi / 180), ("camera_angle_x", "camera_angle_y", 1.0))
 _FOVS = ("camera_fov", "fov_rad")
 _SIDES = (("w", "width", "image_width"), ("h", "height", "image_height"))
-_SIZES = ("resolution", "img_wh", "image_size", "img_size")  # width and height in a list, of the last two one number
+_SIZES = ("resolution", "img_wh", "image_size", "img_size")  # width and height in a list
 _RADIAL, _TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
 _READ = {
     *_MATRICES,
@@ -172,18 +172,19 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
         value = frame.get(key, data.get(key))
         return None if value is None else number(where, key, value, low, high)
 
-    size, center = _size(where, frame, data), _center(where, frame, data, found)
+    size, center = _size(where, frame, data), _center(where, frame, data)
     lens = None
     for source in (frame, data):
         spellings = list(_spellings(where, source, data, size))
         if spellings:
-            name, lens, first = spellings[0]
-            for (other, _, second), k in itertools.product(spellings[1:], (0, 1)):
+            names, lens, first = spellings[0]
+            for (others, _, second), k in itertools.product(spellings[1:], (0, 1)):
                 if abs(first[k] - second[k]) > AGREE * first[k]:  # False where one is not known, NaN
-                    expected = f"{other}: expected the focal length of {name}, {first[k]:.4g} image {_SIDES[k][1]}s"
-                    raise InputError(where, f"{expected}, got {second[k]:.4g}; remove the wrong one")
+                    expected = f"{others[k]}: expected the focal length of {names[k]}, {first[k]:.4g}"
+                    got = f"image {_SIDES[k][1]}s, got {second[k]:.4g}"
+                    raise InputError(where, f"{expected} {got}; remove the wrong one")
             lens = replace(lens, center=center)
-            if name not in _FOVS or lens.center is not None:
+            if names[0] not in _FOVS or lens.center is not None:
                 lens = replace(lens, size=size)
             break
     if lens is None:
@@ -198,28 +199,30 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
     return replace(lens, radial=radial, tangential=tangential)
 
 
-def _spellings(where: str, source: dict, data: dict, size) -> Iterator[tuple[str, Lens, tuple[float, float]]]:
-    """``(key, lens, focal lengths)`` of each spelling in ``source``, in order of preference.
+def _spellings(
+    where: str, source: dict, data: dict, size
+) -> Iterator[tuple[tuple[str, str], Lens, tuple[float, float]]]:
+    """``(keys, lens, focal lengths)`` of each spelling in ``source``, in order of preference.
 
-    Focal lengths are in image widths and heights, NaN where one is not known.
+    Keys are of both axes; focal lengths in image widths and heights, NaN where one is not known.
     """
     width, height = (math.nan, math.nan) if size is None else size
     for key in _MATRICES:
         if key in source:
             fx, fy, cx, cy = _matrix(where, key, source[key])
-            yield key, Lens(focal=(fx, fy), center=(cx, cy)), (fx / width, fy / height)
+            yield (key, key), Lens(focal=(fx, fy), center=(cx, cy)), (fx / width, fy / height)
     for x_key, y_key in _FOCALS:
         if x_key in source or y_key in source:
             fx, fy = _both(where, source, data, (x_key, y_key), (0, 1e9))
-            yield x_key, Lens(focal=(fx, fx if math.isnan(fy) else fy)), (fx / width, fy / height)
+            yield (x_key, y_key), Lens(focal=(fx, fx if math.isnan(fy) else fy)), (fx / width, fy / height)
     for x_key, y_key, unit in _ANGLES:
         if x_key in source or y_key in source:
             x, y = (unit * v for v in _both(where, source, data, (x_key, y_key), (MIN_FOV / unit, math.pi / unit)))
-            yield x_key, Lens(fov=(x, y)), (_widths(x), _widths(y))
+            yield (x_key, y_key), Lens(fov=(x, y)), (_widths(x), _widths(y))
     for key in _FOVS:
         if key in source:
             fov = _fov(where, key, source[key])
-            yield key, Lens(fov=fov), (_widths(fov[0]), math.nan)  # some write the field across twice
+            yield (key, key), Lens(fov=fov), (_widths(fov[0]), math.nan)  # some write the field across twice
     if "focal_length" in source:
         sensor = source.get("sensor_width", data.get("sensor_width"))
         if sensor is None:
@@ -227,7 +230,7 @@ def _spellings(where: str, source: dict, data: dict, size) -> Iterator[tuple[str
             raise InputError(where, f"focal_length: expected sensor_width with it, got {got}; write fl_x in pixels")
         focal = number(where, "focal_length", source["focal_length"], 0, 1e9)
         ratio = focal / number(where, "sensor_width", sensor, 0, 1e9)
-        yield "focal_length", Lens(fov=(2 * math.atan(0.5 / ratio), math.nan)), (ratio, math.nan)
+        yield ("focal_length", "focal_length"), Lens(fov=(2 * math.atan(0.5 / ratio), math.nan)), (ratio, math.nan)
 
 
 def _both(where: str, source: dict, data: dict, keys: tuple[str, str], limits: tuple[float, float]) -> list[float]:
@@ -255,8 +258,6 @@ def _size(where: str, frame: dict, data: dict) -> tuple[int, int] | None:
                     return number(where, key, source[key], 0, 1e6)
             for key in _SIZES:
                 pair = source.get(key)
-                if isinstance(pair, int | float) and key in _SIZES[2:]:
-                    pair = [pair, pair]
                 if isinstance(pair, list) and len(pair) == 2:
                     return number(where, key, pair[axis], 0, 1e6)
         return None
@@ -269,17 +270,22 @@ def _size(where: str, frame: dict, data: dict) -> tuple[int, int] | None:
     return None if w is None or h is None else (int(w), int(h))
 
 
-def _center(where: str, frame: dict, data: dict, found) -> tuple[float, float] | None:
+def _center(where: str, frame: dict, data: dict) -> tuple[float, float] | None:
+    """The principal point, each coordinate first of the frame, NaN where only the other is given."""
+    found = [math.nan, math.nan]
     for source in (frame, data):
-        for key in _MATRICES:
-            if key in source:
-                return _matrix(where, key, source[key])[2:]
-        if "camera_principal_point" in source:
-            return _pair(where, "camera_principal_point", source["camera_principal_point"], -1e6, 1e6)
-        if "cx" in source or "cy" in source:
-            cx, cy = found("cx"), found("cy")
-            return (math.nan if cx is None else cx, math.nan if cy is None else cy)
-    return None
+        matrix = next((key for key in _MATRICES if isinstance(source.get(key), list)), None)
+        if not any(map(math.isnan, found)):
+            break
+        if matrix:
+            pair = _matrix(where, matrix, source[matrix])[2:]
+        elif "camera_principal_point" in source:
+            pair = _pair(where, "camera_principal_point", source["camera_principal_point"], -1e6, 1e6)
+        else:
+            x, y = (number(where, k, source[k], -1e6, 1e6) if k in source else math.nan for k in ("cx", "cy"))
+            pair = x, y
+        found = [new if math.isnan(old) else old for old, new in zip(found, pair)]
+    return None if all(map(math.isnan, found)) else (found[0], found[1])
 
 
 def _matrix(where: str, key: str, value: object) -> tuple[float, float, float, float]:

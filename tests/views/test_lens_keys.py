@@ -44,7 +44,6 @@ READ = {
     "width and height": ({"fl_x": 2 * F, "cx": 2 * CX, "cy": 2 * CY, "width": 2 * S, "height": 2 * S}, [F, F, CX, CY]),
     "resolution": ({"fl_x": 2 * F, "resolution": [2 * S, 2 * S]}, MIDDLE),
     "img_wh": ({"fl_x": 2 * F, "img_wh": [2 * S, 2 * S]}, MIDDLE),
-    "image_size, one number": ({"fl_x": 2 * F, "image_size": 2 * S}, MIDDLE),
     "two that agree": ({"fl_x": F, "camera_angle_x": FOV, "w": S, "h": S}, MIDDLE),
 }
 
@@ -207,6 +206,7 @@ FRAME_FIRST = [  # keys of a frame, keys of the file, pixels
     ({"width": S, "height": S}, {"fl_x": F, "w": 2 * S, "h": 2 * S}, MIDDLE),
     ({"fl_x": 2 * F}, {"intrinsics": K}, [2 * F, 2 * F, CX, CY]),
     ({"cx": 14.0, "cy": 13.0}, {"intrinsics": K}, [F, F, 14.0, 13.0]),
+    ({"cx": 14.0}, {"intrinsics": K}, [F, F, 14.0, CY]),
 ]
 
 
