@@ -235,7 +235,7 @@ def _given_mask(folder: Path, photo: Photo) -> np.ndarray | None:
     (width, height), (w, h) = photo.size, bitmap.size
     if abs(w * height / (h * width) - 1) > 0.01:
         turned = abs(h * height / (w * width) - 1) <= 0.01
-        fix = "turn it upright, as the EXIF orientation of the photograph says" if turned else "save it at that size"
+        fix = "turn it by the EXIF orientation of the photograph" if turned else "save it at that size"
         raise InputError(files[0], f"expected the aspect of {width} x {height}, got {w} x {h}; {fix}")
     return cv2.resize(mask, photo.size, interpolation=cv2.INTER_AREA)
 

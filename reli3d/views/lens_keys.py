@@ -90,8 +90,8 @@ def check_keys(where: str, values: dict) -> None:
             fix = f"negate the {columns} column of each matrix" if columns else "convert the matrices"
             problem = f"{key}: expected camera-to-world matrices in OpenGL axes, got {shown(value)}"
             raise InputError(where, f"{problem}; {fix} and remove the key")
-        number_of_camera = word in ("camera", "cam") and isinstance(value, int)
-        if key in _READ or _nothing(value) or _NO_LENS.fullmatch(word) or number_of_camera:
+        is_index = word in ("camera", "cam") and isinstance(value, int)
+        if key in _READ or _nothing(value) or _NO_LENS.fullmatch(word) or is_index:
             continue
         if _MODEL.fullmatch(word) and isinstance(value, str):
             if re.sub(r"[^A-Z0-9]+", "_", value.upper().strip()) not in _PINHOLE:

@@ -46,8 +46,8 @@ class Hull:
 def normalize(views: Views, mode: str = "auto") -> Similarity:
     """The transform from the frame of the input cameras to the network's frame (no rotation).
 
-    mode ``none``: identity.  ``hull``: the visual hull's box is centered, its longest side scaled to 1, as in
-    training.  ``auto``: the same with ``views.object_box`` if there is one; else the identity if the longest side of
+    mode ``none``: identity.  ``hull``: the visual hull's box is centered, its longest side scaled to 1.
+    ``auto``: the same with ``views.object_box`` if there is one; else the identity if the longest side of
     the hull is 0.8 to 1.15, its coordinates are at most 0.62 and it lies in a sphere of radius 0.87; else ``hull``.
 
     With all cameras within 90 degrees, the hull is cut at 1.3 times the width of the masks and the box aligned with the
