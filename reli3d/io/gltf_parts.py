@@ -34,7 +34,7 @@ def read_parts(
     materials = Materials(document, max_pixels)
     parts, vertices = [], 0
     placed = document.placed_meshes(origin)
-    count = sum(len(document.get(p.mesh, "primitives", list, f"{p.name}.primitives")) for p in placed)
+    count = sum(len(document.get(p.mesh, "primitives", list, p.name)) for p in placed)
     if count > MAX_PARTS:
         document.fail("meshes", f"expected at most {MAX_PARTS} primitives as placed", count, "join the meshes")
     for mesh in placed:
@@ -47,9 +47,8 @@ def read_parts(
                 parts.append(part)
                 vertices += len(part.mesh.vertices)
                 if vertices > max_vertices:
-                    document.fail(
-                        field, f"expected at most {max_vertices} vertices in all", vertices, "simplify the mesh"
-                    )
+                    expected = f"expected at most {max_vertices} vertices in all"
+                    document.fail(field, expected, vertices, "simplify the mesh")
     if not parts:
         raise InputError(path, "expected triangles in its scene, got none; export a mesh")
     if notes is not None:
@@ -64,9 +63,9 @@ def has_material_maps(path: str | os.PathLike) -> bool:
     :func:`read_parts` does.
     """
     document = Document(path, max_bytes=1 << 29, max_vertices=20_000_000)
-    for k in range(len(document.get(document.json, "materials", list, "materials", []))):
+    for k in range(len(document.get(document.json, "materials", list, "", []))):
         material = document.item("materials", k, f"materials[{k}]")
-        pbr = document.get(material, "pbrMetallicRoughness", dict, f"materials[{k}].pbrMetallicRoughness", {})
+        pbr = document.get(material, "pbrMetallicRoughness", dict, f"materials[{k}]", {})
         if "metallicRoughnessTexture" in pbr:
             return True
     return False
@@ -77,7 +76,7 @@ class _Primitive:
 
     def __init__(self, document: Document, primitive: dict, field: str):
         self.document, self.primitive, self.field = document, primitive, field
-        self.attributes = document.get(primitive, "attributes", dict, f"{field}.attributes")
+        self.attributes = document.get(primitive, "attributes", dict, field)
         if "POSITION" not in self.attributes:
             document.fail(f"{field}.attributes", "expected POSITION", sorted(self.attributes))
         if DRACO in document.extensions(primitive, field, DRACO):  # attributes with data are its fallback
@@ -93,9 +92,8 @@ class _Primitive:
             return None
         values = self._values(name, attributes, kinds)
         if len(values) != len(self.position):
-            self.document.fail(
-                f"{self.field}.attributes.{name}", f"expected {len(self.position)} elements", len(values)
-            )
+            expected = f"expected {len(self.position)} elements"
+            self.document.fail(f"{self.field}.attributes.{name}", expected, len(values))
         return values
 
     def _values(self, name: str, attributes: dict, kinds: tuple[str, ...]) -> np.ndarray:
@@ -157,7 +155,7 @@ class _Primitive:
     def _morphed(self, weights: list[float]) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
         """Position, normal and tangent with the morph targets at their default weights."""
         position, normal, tangent = self.position, self.read("NORMAL", "VEC3"), self.read("TANGENT", "VEC4")
-        targets = self.document.get(self.primitive, "targets", list, f"{self.field}.targets", [])
+        targets = self.document.get(self.primitive, "targets", list, self.field, [])
         for target, weight in zip(targets, weights):
             if weight == 0.0:
                 continue

@@ -157,7 +157,7 @@ def frame_record(
     origin: origin of the views' frame in the folder's frame; the matrices map from the folder's frame.
     """
     shift = torch.tensor(origin, dtype=torch.float64, device="cpu")
-    read = Similarity(1.0, torch.eye(3, dtype=torch.float64, device="cpu"), -shift)
+    read = Similarity.without_rotation(-shift)
     back = output_from_views.rotation @ shift
     output = Similarity(output_from_views.scale, output_from_views.rotation, output_from_views.translation + back)
     return {

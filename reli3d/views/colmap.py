@@ -10,12 +10,14 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path, PurePath
 
 import numpy as np
 
 from reli3d.errors import InputError, shown
 from reli3d.io.files import file_size, opened
+from reli3d.io.gltf import rotation_of
 from reli3d.views import colmap_binary
 from reli3d.views.file_names import FolderIndex, images_below, images_in
 from reli3d.views.frames import Frame, Lens, file_within, nearest_rigid, number
@@ -41,13 +43,12 @@ def find_colmap(folder: Path) -> list[Path]:
     If a model has both, the text file, which users edit, comes first.
     """
     places = [at for place in PLACES for at in (sorted(folder.glob(place)) if place else [folder])]
-    found = [
-        at / f"images.{ending}"
-        for at in dict.fromkeys(places)
-        for ending in ("txt", "bin")
-        if all(os.path.lexists(at / f"{name}.{ending}") for name in ("cameras", "images"))
-    ]
-    return found
+    found = [at / f"images.{ending}" for at in dict.fromkeys(places) for ending in ("txt", "bin")]
+    return [path for path in found if os.path.lexists(path) and os.path.lexists(_cameras_of(path))]
+
+
+def _cameras_of(images: Path) -> Path:
+    return images.with_name("cameras" + images.suffix)
 
 
 def read_colmap(folder: Path, models: Sequence[Path]) -> tuple[list[Frame], list[str]]:
@@ -61,28 +62,25 @@ def read_colmap(folder: Path, models: Sequence[Path]) -> tuple[list[Frame], list
     best = max(range(len(models)), key=lambda k: len(entries[k]))
     path = models[best]
     if len(models) > 1:
-        sizes = ", ".join(f"{_short(folder, p)} {len(e)}" for p, e in zip(models, entries))
-        notes.append(f"{len(models)} COLMAP models, with numbers of images {sizes}: {_short(folder, path)} is used")
+        names = [p.relative_to(folder).as_posix() for p in models]
+        sizes = ", ".join(f"{name} {len(e)}" for name, e in zip(names, entries))
+        notes.append(f"{len(models)} COLMAP models, with numbers of images {sizes}: {names[best]} is used")
     if not entries[best]:
         raise InputError(path, "expected at least one image, got none; export the model again")
-    cameras = path.with_name("cameras" + path.suffix)
+    cameras = _cameras_of(path)
     lenses = _lenses(_text_cameras(cameras) if path.suffix == ".txt" else colmap_binary.cameras(cameras))
     if not lenses:
         raise InputError(cameras, "expected at least one camera, got none; export the model again")
-    index, names = FolderIndex(), [PurePath(name) for name, *_ in entries[best]]
+    index, listed = FolderIndex(), [PurePath(name) for name, *_ in entries[best]]
     name, count = Counter(name for name, *_ in entries[best]).most_common(1)[0]
     if count > 1:
-        raise InputError(
-            path, f"NAME: expected each image once, got {shown(name)} {count} times; export the model again"
-        )
+        raise InputError(path, f"NAME: expected each image once, got {shown(name)} {count} times; export it again")
     places = [at for at in (folder / "images", folder) if at.is_dir()]
-    images = max(places, key=lambda at: sum(index.find(at, name) is not None for name in names))
+    images = max(places, key=lambda at: sum(index.find(at, name) is not None for name in listed))
     frames, missing = [], []
     for name, where, pose, camera in sorted(entries[best], key=lambda entry: entry[0]):
         if camera not in lenses:
-            raise InputError(
-                where, f"CAMERA_ID: expected one of the model's cameras, got {shown(camera)}; export it again"
-            )
+            raise InputError(where, f"CAMERA_ID: expected one of its cameras, got {shown(camera)}; export it again")
         image = file_within(images, where, "NAME", name)
         found = image if os.path.isfile(image) else index.find(images, PurePath(name))
         c2w = _pose(where, pose)
@@ -91,14 +89,9 @@ def read_colmap(folder: Path, models: Sequence[Path]) -> tuple[list[Frame], list
         else:
             frames.append(Frame(where, name, found, None, c2w, lenses[camera]))
     if not frames:
-        raise InputError(
-            path, f"NAME: expected images in {images}, got {shown(missing[0])} which does not exist; copy them in"
-        )
+        got = f"{shown(missing[0])} which does not exist"
+        raise InputError(path, f"NAME: expected images in {images}, got {got}; copy them in")
     return frames, notes + _counted(folder, images, frames, missing)
-
-
-def _short(folder: Path, path: Path) -> str:
-    return path.relative_to(folder).as_posix()
 
 
 def _counted(folder: Path, images: Path, frames: list[Frame], missing: list[str]) -> list[str]:
@@ -115,28 +108,25 @@ def _counted(folder: Path, images: Path, frames: list[Frame], missing: list[str]
     return notes
 
 
-def _entries(path: Path) -> list[tuple[str, str, list[float], object]]:
-    entries: list[tuple[str, str, list[float], object]] = []
-    for entry in _text_images(path) if path.suffix == ".txt" else colmap_binary.images(path):
-        entries.append(entry)
-        if len(entries) > MAX_IMAGES:
-            raise InputError(path, f"expected at most {MAX_IMAGES} images; export the views to be used")
+def _entries(path: Path) -> list[tuple]:
+    """``(name, where, pose, camera)`` of each image."""
+    read = _text_images if path.suffix == ".txt" else colmap_binary.images
+    entries = list(islice(read(path), MAX_IMAGES + 1))
+    if len(entries) > MAX_IMAGES:
+        raise InputError(path, f"expected at most {MAX_IMAGES} images; export the views to be used")
     return entries
 
 
 def _text_images(path: Path) -> Iterator[tuple[str, str, list[float], str]]:
-    """``(name, where, pose, camera)`` of each image; lines of points, which some programs leave out, by their form."""
+    """See :func:`_entries`; lines of points, which some programs leave out, are recognized by their form."""
     for n, line in _lines(path):
         if _POINTS.fullmatch(line):
             continue
         words = line.split(maxsplit=9)
         where = f"{path}: line {n}"
         if len(words) != 10:
-            raise InputError(
-                where,
-                "expected ID, rotation (4), translation (3), camera and name, got "
-                f"{shown(line)}; export the model again",
-            )
+            expected = "expected ID, rotation (4), translation (3), camera and name"
+            raise InputError(where, f"{expected}, got {shown(line)}; export the model again")
         yield words[9], where, [_real(where, "QVEC TVEC", v) for v in words[1:8]], words[8]
 
 
@@ -145,14 +135,7 @@ def _pose(where: str, values: list[float]) -> np.ndarray:
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if abs(norm - 1.0) > 1e-2:  # COLMAP writes unit quaternions with at least six digits
         raise InputError(where, f"QVEC: expected a unit quaternion, got length {norm:.4g}; export the model again")
-    w, x, y, z = w / norm, x / norm, y / norm, z / norm
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = rotation_of(w, x, y, z)
     c2w = np.eye(4)
     c2w[:3, :3] = rotation.T * (1, -1, -1)  # columns y and z turned: OpenCV to OpenGL axes
     c2w[:3, 3] = -rotation.T @ np.array(t)
@@ -164,9 +147,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[str, str, str, list[float], list
     for n, line in _lines(path):
         where, words = f"{path}: line {n}", line.split()
         if len(words) < 5:
-            raise InputError(
-                where, f"expected ID, model, width, height, parameters, got {shown(line)}; export it again"
-            )
+            raise InputError(where, f"expected ID, model, width, height, parameters, got {shown(line)}; export again")
         if words[1] not in _MODELS:
             raise colmap_binary.no_pinhole(where, words[1], _MODELS)
         size = [_real(where, field, v) for field, v in zip(("WIDTH", "HEIGHT"), words[2:4])]
@@ -179,18 +160,12 @@ def _lenses(cameras: Iterator) -> dict[object, Lens]:
         if key in lenses:
             raise InputError(where, f"CAMERA_ID: expected every camera once, got {shown(key)} twice; export it again")
         focals, radial, tangential = _MODELS[model]
-        if len(values) != focals + 2 + radial + tangential:
-            raise InputError(
-                where,
-                f"PARAMS: expected {focals + 2 + radial + tangential} numbers for {model}, got "
-                f"{len(values)}; export it again",
-            )
+        if len(values) != (count := focals + 2 + radial + tangential):
+            raise InputError(where, f"PARAMS: expected {count} numbers for {model}, got {len(values)}; export it again")
         values = [number(where, "PARAMS", v, -1e9, 1e9) for v in values]
         if min(values[:focals]) <= 0 or min(size) < 1 or max(size) > 1e6:
-            raise InputError(
-                where,
-                f"PARAMS: expected a positive size and focal length, got {shown([*size, *values])}; export it again",
-            )
+            got = shown([*size, *values])
+            raise InputError(where, f"PARAMS: expected a positive size and focal length, got {got}; export it again")
         lenses[key] = Lens(
             focal=(values[0], values[focals - 1]),
             center=(values[focals], values[focals + 1]),

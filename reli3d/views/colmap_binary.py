@@ -15,17 +15,8 @@ from reli3d.views.frames import MAX_PATH
 
 # in the order of their numbers; the pinhole cameras and those with a polynomial lens have so many parameters
 _NAMES = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "OPENCV_FISHEYE",
-    "FULL_OPENCV",
-    "FOV",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "THIN_PRISM_FISHEYE",
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
 )
 _PARAMETERS = (3, 4, 4, 5, 8)
 _POINT = 24  # bytes: x, y, the number of the point
@@ -57,9 +48,8 @@ def images(path: Path) -> Iterator[tuple[str, str, list[float], int]]:
 
 def no_pinhole(where: str, name: str, known: Collection[str]) -> InputError:
     """The error for a camera whose lens has no polynomial."""
-    return InputError(
-        where, f"MODEL: expected {', '.join(known)}, got {shown(name)}; run colmap image_undistorter first"
-    )
+    expected = f"expected {', '.join(known)}, got {shown(name)}"
+    return InputError(where, f"MODEL: {expected}; run colmap image_undistorter first")
 
 
 class _Entries:
@@ -90,10 +80,8 @@ class _Entries:
         start = self.file.tell()
         data, end, _ = self.file.read(4 * MAX_PATH + 1).partition(b"\0")
         if not end:
-            raise InputError(
-                where,
-                f"NAME: expected a name of at most {4 * MAX_PATH} bytes, got no end of it; export the model again",
-            )
+            expected = f"expected a name of at most {4 * MAX_PATH} bytes"
+            raise InputError(where, f"NAME: {expected}, got no end of it; export the model again")
         self.file.seek(start + len(data) + 1)
         try:
             return data.decode("utf-8")
@@ -101,7 +89,5 @@ class _Entries:
             raise InputError(where, "NAME: expected UTF-8, got other bytes; export the model again") from None
 
     def _short(self):
-        raise InputError(
-            self.where,
-            f"expected more than the {self.size} bytes of the file; it is cut off or no COLMAP model, export it again",
-        )
+        expected = f"expected more than the {self.size} bytes of the file"
+        raise InputError(self.where, f"{expected}; it is cut off or no COLMAP model, export it again")

@@ -30,12 +30,8 @@ def mask_values(path: os.PathLike, bitmap: Image.Image, notes: list[str]) -> Ima
     (antialiasing).  Of a mask with two values, black and one below white, nonzero is the object, with a note.  Raises
     InputError, with the values found, for several labels and for masks without black.
     """
-    alpha = used_alpha(bitmap)
-    if alpha is not None:
-        return _coverage(path, alpha, notes)
-    if bitmap.mode in _TOP:
-        return _coverage(path, bitmap, notes)
-    return _color_coverage(path, bitmap.convert("RGB"), notes)
+    channel = used_alpha(bitmap) or (bitmap if bitmap.mode in _TOP else None)
+    return _coverage(path, channel, notes) if channel else _color_coverage(path, bitmap.convert("RGB"), notes)
 
 
 def alpha_values(bitmap: Image.Image, notes: list[str]) -> Image.Image | None:
@@ -81,9 +77,8 @@ def check_one_label(folder: os.PathLike, notes: Sequence[str]) -> None:
     """Raises InputError where the notes of several masks name different values or colors of the object."""
     labels = sorted({note.removeprefix(LABEL).partition(" instead")[0] for note in notes if note.startswith(LABEL)})
     if len(labels) > 1:
-        raise InputError(
-            folder, f"masks: expected one label in all masks, got {', '.join(labels[:4])}; save masks of one object"
-        )
+        expected = f"expected one label in all masks, got {', '.join(labels[:4])}"
+        raise InputError(folder, f"masks: {expected}; save masks of one object")
 
 
 def _coverage(path: os.PathLike, channel: Image.Image, notes: list[str]) -> Image.Image:
@@ -212,9 +207,6 @@ class MaskFiles:
         images = self._images.get(os.path.realpath(mask), [])
         if len({os.path.realpath(p) for p in images}) > 1:
             first, second = (self._relative(p).as_posix() for p in images[:2])
-            raise InputError(
-                mask,
-                f"expected the mask of one image, got that of {shown(first)} and {shown(second)}; put masks into "
-                "sub-folders as the images are",
-            )
+            got = f"that of {shown(first)} and {shown(second)}"
+            raise InputError(mask, f"expected the mask of one image, got {got}; put masks into sub-folders as images")
         return mask
