@@ -202,11 +202,17 @@ def test_rounding_in_the_matrix_is_cleaned_up(tmp_path):
     assert float((rotation - exact).abs().max()) < 1e-4  # four digits
 
 
-def test_paths_with_spaces_and_other_letters(tmp_path):
+def test_names_of_files(tmp_path):
+    """Spaces and other letters, accents in either composition; resource files of macOS are no images."""
     folder = tmp_path / "mein Objekt ñ"
     photo(folder / "im ages/é 1.png")
     transforms(folder, [{"file_path": "im ages/é 1.png", "transform_matrix": hostile.pose(0), "camera_fov": 0.6}])
     assert load_views(str(folder)).names == ("im ages/é 1.png",)
+    composed, decomposed = "St\u00fcck.png", "Stu\u0308ck.png"
+    for name in (decomposed, "._a.png"):
+        (tmp_path / name).write_bytes(b"")
+    assert FolderIndex().find(tmp_path, PurePath(composed)) == tmp_path / decomposed
+    assert images_in(tmp_path) == [tmp_path / decomposed] and tmp_path / "._a.png" not in images_below(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["Camera_01", "Lantern_01", "UCO3D_217-72983-41010", "UCO3D_639-13622-90739"])
@@ -247,15 +253,3 @@ def test_the_lighting_of_a_capture_is_read(tmp_path):
     transforms(tmp_path, frames, lighting="turntable")
     with pytest.raises(InputError, match="lighting: expected object or camera"):
         load_views(tmp_path)
-
-
-def test_accents_in_either_composition_name_one_file(tmp_path):
-    composed, decomposed = "St\u00fcck.png", "Stu\u0308ck.png"
-    (tmp_path / decomposed).write_bytes(b"")
-    assert FolderIndex().find(tmp_path, PurePath(composed)) == tmp_path / decomposed
-
-
-def test_resource_files_of_macos_are_no_images(tmp_path):
-    for name in ("a.png", "._a.png"):
-        (tmp_path / name).write_bytes(b"")
-    assert images_in(tmp_path) == images_below(tmp_path) == [tmp_path / "a.png"]
