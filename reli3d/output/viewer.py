@@ -75,11 +75,9 @@ def photograph_stops(views: Views) -> list[dict]:
     for i in range(len(views)):
         height, width = views.masks[i].shape
         rgba = np.concatenate([views.images[i].cpu().numpy(), views.masks[i].cpu().numpy()[..., None]], -1)
-        bitmap = Image.fromarray((rgba * 255 + 0.5).astype(np.uint8))
         scale = min(1.0, MAX_IMAGE_PIXELS / max(width, height))
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        if size != bitmap.size:
-            bitmap = bitmap.resize(size, Image.Resampling.BOX)
+        bitmap = Image.fromarray((rgba * 255 + 0.5).astype(np.uint8)).resize(size, Image.Resampling.BOX)
         data = io.BytesIO()
         # an unregistered name would make Pillow import all formats
         bitmap.save(data, WebPImagePlugin.WebPImageFile.format, quality=QUALITY, method=METHOD)

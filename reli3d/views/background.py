@@ -42,7 +42,6 @@ def _loaded(network: str, option: str) -> Callable[[Image.Image], Image.Image]:
     try:
         session = rembg.new_session(network)
     except (OSError, ValueError) as error:  # no network, a full disk; another file than the published one
-        raise InputError(
-            option, f"expected the network {network} of rembg, got {error}; it is fetched once, or give masks"
-        ) from None
+        expected = f"expected the network {network} of rembg"
+        raise InputError(option, f"{expected}, got {error}; it is fetched once, or give masks") from None
     return lambda bitmap: rembg.remove(bitmap.convert("RGB"), session=session, only_mask=True).convert("L")

@@ -64,15 +64,12 @@ def choose_views(c2w: Tensor, count: int, *, min_distance: float = 0.0) -> list[
 def spread_notes(c2w: Tensor) -> list[str]:
     """Notes on near-duplicate views and on a narrow baseline, at most one line each."""
     angle, distance = view_distances(c2w)
-    notes = []
-    # near an earlier view
-    again = (distance + torch.full_like(distance, torch.inf).triu()).amin(1) < DUPLICATE_DISTANCE_RAD
-    if bool(again.any()):
-        which = ", ".join(str(i) for i in again.nonzero()[:, 0].tolist()[:8]) + (", ..." if again.sum() > 8 else "")
-        notes.append(
-            f"{int(again.sum())} of {len(c2w)} views lie within {math.degrees(DUPLICATE_DISTANCE_RAD):.0f} degrees of "
-            f"an earlier one and add little information: {which}"
-        )
+    notes, limit = [], DUPLICATE_DISTANCE_RAD
+    again = [i for i, row in enumerate(distance.tolist()) if min(row[:i], default=math.inf) < limit]
+    if again:
+        which = ", ".join(map(str, again[:8])) + (", ..." if len(again) > 8 else "")
+        text = f"{len(again)} of {len(c2w)} views lie within {math.degrees(limit):.0f} degrees of an earlier one"
+        notes.append(f"{text} and add little information: {which}")
     widest = float(angle.max())
     if len(c2w) > 1 and widest < NARROW_BASELINE_RAD:
         text = f"narrow baseline: all views lie within {math.degrees(widest):.1f} degrees"
