@@ -47,9 +47,9 @@ def texture_images(asset: Asset, kind: str = "png") -> dict[str, bytes]:
     rough = asset.textures.roughness
     orm = torch.stack([torch.ones_like(rough), rough, asset.textures.metallic], -1)  # no occlusion is baked
     base_color = linear_to_srgb(asset.textures.base_color)
-    maps = {"base_color": base_color, "metallic_roughness": orm, "normal": asset.textures.normal}
-    values = list(maps.values())
-    return dict(zip(maps, over_rows(len(values), 1, lambda k, _: encode_image(values[k], kind)), strict=True))
+    maps = (base_color, orm, asset.textures.normal)
+    encoded = over_rows(len(maps), 1, lambda k, _: encode_image(maps[k], kind))
+    return dict(zip(("base_color", "metallic_roughness", "normal"), encoded, strict=True))
 
 
 def addressing(asset: Asset) -> tuple[str, str]:
