@@ -19,7 +19,6 @@ import trimesh
 from PIL import Image
 
 from reli3d.geometry.bake import bake
-from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import glb_bytes, read_glb, write_glb
@@ -175,16 +174,6 @@ def test_own_reader_gives_the_asset_and_every_code_of_a_color_back(asset, tmp_pa
     color = read_glb(tmp_path / "a.glb")[0].textures.base_color
     assert torch.equal((linear_to_srgb(color) * 255).round().long(), codes)
     assert float(color[11, 12, 0]) == pytest.approx(0.502886, abs=1e-5)  # IEC 61966-2-1 at code 188
-
-
-def test_an_unsymmetric_arrow_keeps_its_axes(tmp_path, asset):
-    arrow = Mesh(
-        torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]),
-        torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]).int(),
-    )
-    write_glb(tmp_path / "a.glb", Asset(unwrap(arrow, texture_size=64).with_tangents(), asset.textures))
-    shape = trimesh.load(tmp_path / "a.glb", force="mesh")
-    assert np.allclose(shape.bounds, [[0, 0, 0], [1, 2, 3]]) and shape.volume == pytest.approx(1.0, rel=1e-6)
 
 
 def test_node_transforms_reach_positions_normals_and_mirrors(asset, tmp_path):

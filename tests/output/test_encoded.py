@@ -17,7 +17,7 @@ from reli3d.render.lights import studio
 from reli3d.views.views import Views
 from tests.support.scenes import ball_mesh, textures
 
-RECORD = {"output_from_input": [1], "model_from_input": [2], "weights": {"file": "x"}}
+RECORD = {"output_from_input": [1], "model_from_input": [2], "weights": {"file": "x"}}  # all of it in the mesh's extras
 PREVIEW = np.zeros((8, 8, 3), np.uint8)
 MOVED = (1.0, 2.0, 3.0)
 
@@ -43,10 +43,9 @@ def written(folder, asset, views, **options):
 def test_the_mesh_is_moved_and_the_page_shows_it_in_place(tmp_path, asset, views, threads, count):
     threads(count)
     written(tmp_path / "ball", asset, views, translation=MOVED)
-    extras = {k: RECORD[k] for k in ("output_from_input", "model_from_input", "weights")}
-    assert (tmp_path / "ball" / "mesh.glb").read_bytes() == glb_bytes(asset, extras=extras, translation=MOVED)
+    assert (tmp_path / "ball" / "mesh.glb").read_bytes() == glb_bytes(asset, extras=RECORD, translation=MOVED)
     (shown,) = re.findall(r'"glb": "([^"]*)"', (tmp_path / "ball" / "viewer.html").read_text())
-    assert base64.b64decode(shown) == glb_bytes(asset, extras=extras)
+    assert base64.b64decode(shown) == glb_bytes(asset, extras=RECORD)
     assert results.complete(tmp_path / "ball", tmp_path)
 
 
@@ -54,9 +53,8 @@ def test_the_page_of_a_refined_result_has_both(tmp_path, asset, views):
     start = replace(asset, mesh=ball_mesh(2, 0.6))
     written(tmp_path / "ball", asset, views, before=start)
     page = (tmp_path / "ball" / "viewer.html").read_text()
-    extras = {k: RECORD[k] for k in ("output_from_input", "model_from_input", "weights")}
     shown = dict(re.findall(r'"name": "(after|before)", "glb": "([^"]*)"', page))
-    assert base64.b64decode(shown["after"]) == glb_bytes(asset, extras=extras)
+    assert base64.b64decode(shown["after"]) == glb_bytes(asset, extras=RECORD)
     assert base64.b64decode(shown["before"]) == glb_bytes(start)
 
 
