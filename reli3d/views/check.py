@@ -240,12 +240,10 @@ def _panel(views, hull, middle, reach, frustums, title, vertical) -> Image.Image
     """The rig with x to the right.  vertical: world axis along the image's rows, and its sign downwards."""
     down, sign = vertical
     bitmap = Image.new("RGB", (PANEL, PANEL), "#f4f4f4")
-    draw = ImageDraw.Draw(bitmap)
-    zoom = 0.5 * PANEL / reach
+    draw, zoom = ImageDraw.Draw(bitmap), 0.5 * PANEL / reach
 
-    def at(points) -> list[tuple[float, float]]:
-        p = (np.asarray(points, dtype=np.float64).reshape(-1, 3) - middle) * zoom
-        return [(PANEL / 2 + a, PANEL / 2 + sign * b) for a, b in zip(p[:, 0], p[:, down])]
+    def at(points: np.ndarray) -> list[list[float]]:
+        return (PANEL / 2 + (points.reshape(-1, 3) - middle)[:, [0, down]] * zoom * (1, sign)).tolist()
 
     if len(hull.points):
         points = hull.points.numpy()

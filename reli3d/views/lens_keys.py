@@ -241,11 +241,11 @@ def _size(where: str, frame: dict, data: dict) -> tuple[int, int] | None:
         return None
 
     w, h = side(0), side(1)
-    if any(side is not None and side < 1 for side in (w, h)):
-        raise InputError(where, f"w, h: expected at least 1 pixel, got {w} x {h}; correct the camera file")
-    if (w is None) != (h is None):
-        raise InputError(where, f"w, h: expected both or none, got {w} x {h}; write the size of the images")
-    return None if w is None or h is None else (int(w), int(h))
+    if w is None and h is None:
+        return None
+    if w is None or h is None or min(w, h) < 1:
+        raise InputError(where, f"w, h: expected both, at least 1 pixel, got {w} x {h}; write the size of the images")
+    return int(w), int(h)
 
 
 def _center(where: str, frame: dict, data: dict) -> tuple[float, float] | None:
