@@ -126,6 +126,10 @@ def glb_bytes(
         view = {"buffer": 0, "byteOffset": offset, "byteLength": len(chunk)}
         views.append({**view, "target": targets[k]} if k < len(targets) else view)
         offset += len(chunk) + -len(chunk) % 4
+
+    def source(image: int) -> dict:  # a viewer that does not know the extension finds none
+        return {"source": image} if textures == "png" else {"extensions": {WEBP: {"source": image}}}
+
     info: dict[str, object] = {"version": "2.0", "generator": f"reli3d {reli3d.__version__}"}
     if extras:
         info["extras"] = dict(extras)
@@ -148,7 +152,7 @@ def glb_bytes(
                 "doubleSided": bool(double_sided),
             }
         ],
-        "textures": [{"sampler": 0, "name": name, **_source(k, textures)} for k, name in enumerate(names)],
+        "textures": [{"sampler": 0, "name": name, **source(k)} for k, name in enumerate(names)],
         "images": [
             {"bufferView": len(targets) + k, "mimeType": f"image/{textures}", "name": name}
             for k, name in enumerate(names)
@@ -173,11 +177,6 @@ def glb_bytes(
     for chunk in chunks:
         parts += [chunk, b"\0" * (-len(chunk) % 4)]
     return b"".join(parts)
-
-
-def _source(image: int, kind: str) -> dict:
-    """Where a texture finds its image; a viewer that does not know the extension finds none."""
-    return {"source": image} if kind == "png" else {"extensions": {WEBP: {"source": image}}}
 
 
 def _geometry(mesh) -> tuple[dict, list[bytes]]:

@@ -50,7 +50,10 @@ def viewer_page(
     data = {
         "name": name,
         "meshes": [{"name": k, "glb": _base64(v.glb), **v.shadow} for k, v in meshes.items()],
-        "lights": [_light(k, v) for k, v in lights.items()],
+        "lights": [
+            {"name": k, "hdr": _base64(environment_bytes(v)), "harmonics": light_harmonics(Environment(v)).T.tolist()}
+            for k, v in lights.items()
+        ],
         "views": list(stops),
         "middle": middle.tolist(),
         "radius": radius,
@@ -109,9 +112,3 @@ def shadow(mesh: Mesh, scene: RayScene | None = None) -> dict[str, str | float]:
     largest = float(blocked.abs().amax()) if blocked.numel() else 0.0
     steps = (blocked * (127.0 / max(largest, MIN_TRANSFER))).round().to(torch.int8)
     return {"blocked": _base64(zlib.compress(steps.numpy().tobytes(), DEFLATE_LEVEL)), "largest": largest}
-
-
-def _light(name: str, radiance: Tensor) -> dict:
-    """An environment map and its spherical harmonics for each channel."""
-    harmonics = light_harmonics(Environment(radiance)).T.tolist()
-    return {"name": name, "hdr": _base64(environment_bytes(radiance)), "harmonics": harmonics}
