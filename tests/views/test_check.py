@@ -144,9 +144,11 @@ def test_cameras_without_a_common_up_axis_suggest_nothing():
     assert up_axis(c2w) is None
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.25, 3.0])
-@pytest.mark.parametrize("axes, words", [(torch.eye(4), "world-to-camera; store"), (FLIP, "in OpenCV axes")])
-def test_world_to_camera_matrices_of_a_folder_are_named(tmp_path, offset, axes, words):
+STORED, OPENCV = (torch.eye(4), "world-to-camera; store"), (FLIP, "in OpenCV axes")
+
+
+@pytest.mark.parametrize("axes, words, offset", [(*STORED, 0.0), (*OPENCV, 0.25), (*STORED, 3.0), (*OPENCV, 3.0)])
+def test_world_to_camera_matrices_of_a_folder_are_named(tmp_path, axes, words, offset):
     """Read as poses, those of a rig about the origin put all eyes in one point, and others move the origin."""
     folder = tmp_path / "object"
     shutil.copytree(EXAMPLE, folder)
