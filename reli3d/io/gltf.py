@@ -138,7 +138,8 @@ class Document:
             self.fail("header.version", "expected 2", version, "export as glTF 2.0")
         if length > len(data):
             self.fail("header.length", f"expected at most {len(data)}, the file's size", length, "the file is cut off")
-        chunks, at = {}, 12
+        chunks: dict[bytes, bytes] = {}
+        at = 12
         while at + 8 <= length:
             size, kind = struct.unpack("<I4s", data[at : at + 8])
             if at + 8 + size > length:

@@ -6,6 +6,7 @@ Color is sRGB in [0, 1] with straight alpha, including the background.  Cameras 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -94,7 +95,7 @@ class Views(Movable):
         indices = list(range(which)) if isinstance(which, int) else list(which)
         if not indices or min(indices) < 0 or max(indices) >= len(self):
             raise ValueError(f"which: expected 1 to {len(self)} views of {len(self)}, got {which}")
-        lists = {k: tuple(getattr(self, k)[i] for i in indices) for k in ("images", "masks", "names")}
+        lists: dict[str, Any] = {k: tuple(getattr(self, k)[i] for i in indices) for k in ("images", "masks", "names")}
         return replace(self, **lists, c2w=self.c2w[indices], intrinsics=self.intrinsics[indices], chosen=None)
 
     def taken(self) -> "Views":
