@@ -108,14 +108,11 @@ def model(tmp_path):
     return tmp_path, images.splitlines()[1:]
 
 
-def write(folder, lines, newline="\n", bom=b""):
-    (folder / "sparse/0/images.txt").write_bytes(bom + newline.join([*lines, ""]).encode())
+def write(folder, lines):
+    (folder / "sparse/0/images.txt").write_text("\n".join([*lines, ""]))
 
 
 FORMS = {
-    "points": lambda lines: lines,
-    "empty lines for points": lambda lines: [line for pose in lines[::2] for line in (pose, "")],
-    "no lines of points": lambda lines: lines[::2],
     "one without points": lambda lines: [lines[0], *lines[2:]],
     "blank lines": lambda lines: ["", *[line for pose in lines for line in (pose, "", "")]],
     "comments between": lambda lines: [line for pose in lines for line in ("# image", pose, "  # points")],
@@ -124,16 +121,12 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize(
-    "form, newline, bom",
-    [*((form, "\n", b"") for form in FORMS), ("points", "\r\n", b""), ("no lines of points", "\n", b"\xef\xbb\xbf")],
-)
-def test_every_image_is_read(model, form, newline, bom):
+@pytest.mark.parametrize("form", FORMS)
+def test_every_image_is_read(model, form):
+    """More forms, line ends and byte order marks are among the random models of ``tests.support.known``."""
     folder, lines = model
     expected = load_views(folder)
-    write(folder, FORMS[form](lines), newline, bom)
-    cameras = (folder / "sparse/0/cameras.txt").read_text()
-    (folder / "sparse/0/cameras.txt").write_bytes(bom + cameras.replace("\n", newline).encode())
+    write(folder, FORMS[form](lines))
     views = load_views(folder)
     assert views.names == NAMES and views.notes == expected.notes
     assert bool((views.c2w == expected.c2w).all())

@@ -196,9 +196,7 @@ def put(root, names):
 
 NESTED = ["images/front/0.png", "images/back/0.png", "images/front/1.png"]
 LAYOUTS = {
-    "mirrored": ["masks/front/0.png", "masks/back/0.png", "masks/front/1.png"],
     "mirrored from the root": ["masks/images/front/0.png", "masks/images/back/0.png", "masks/images/front/1.png"],
-    "ending after ending": ["masks/front/0.png.png", "masks/back/0.png.png", "masks/front/1.png.png"],
     "another ending": ["masks/front/0.tif", "masks/back/0.tif", "masks/front/1.tif"],
     "folder mask": ["mask/front/0.png", "mask/back/0.png", "mask/front/1.png"],
     "given": ["given/front/0.png", "given/back/0.png", "given/front/1.png"],
