@@ -59,7 +59,7 @@ class Document:
     appended to ``notes``, one line each.
     """
 
-    def __init__(self, path: str | os.PathLike, *, max_bytes: int, max_vertices: int):
+    def __init__(self, path: str | os.PathLike, *, max_bytes: int = 1 << 29, max_vertices: int = 20_000_000):
         self.path, self.max_bytes, self.max_vertices = path, max_bytes, max_vertices
         self.taken = 0  # accessor elements read so far, over all meshes
         self.notes: list[str] = []
@@ -271,10 +271,7 @@ class Document:
         return np.stack([index[k], index[k + 1 + k % 2], index[k + 2 - k % 2]], 1)
 
     def placed_meshes(self, origin: list[float] | None = None) -> list[Placed]:
-        """The meshes of all visible nodes of the scene.
-
-        origin: receives the position of the first one, which is subtracted from all.
-        """
+        """The meshes of all visible nodes; origin: receives the position of the first, which is subtracted from all."""
         scenes = self.get(self.json, "scenes", list, "", [])
         nodes = self.get(self.json, "nodes", list, "", [])
         if scenes:

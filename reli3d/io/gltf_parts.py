@@ -57,18 +57,12 @@ def read_parts(
 
 
 def has_material_maps(path: str | os.PathLike) -> bool:
-    """Whether a material of the file has a metallic-roughness texture.
-
-    Without one, roughness and metallic are two numbers, which exporters write as defaults.  Raises InputError as
-    :func:`read_parts` does.
-    """
-    document = Document(path, max_bytes=1 << 29, max_vertices=20_000_000)
-    for k in range(len(document.get(document.json, "materials", list, "", []))):
-        material = document.item("materials", k, f"materials[{k}]")
-        pbr = document.get(material, "pbrMetallicRoughness", dict, f"materials[{k}]", {})
-        if "metallicRoughnessTexture" in pbr:
-            return True
-    return False
+    """Whether a material has a metallic-roughness texture, not two numbers, which exporters write as defaults."""
+    document = Document(path)
+    count = len(document.get(document.json, "materials", list, "", []))
+    materials = ((f"materials[{k}]", document.item("materials", k, f"materials[{k}]")) for k in range(count))
+    factors = (document.get(material, "pbrMetallicRoughness", dict, where, {}) for where, material in materials)
+    return any("metallicRoughnessTexture" in pbr for pbr in factors)
 
 
 class _Primitive:

@@ -48,10 +48,7 @@ def complete(folder: Path, source: Path, *, refined: bool = False) -> bool:
 
 
 def measure(mesh: Mesh, scene: RayScene, views: Views) -> Callable[[], dict]:
-    """Starts the measurements of a result in the pool, as plain values.
-
-    ``mesh``: the report of the mesh welded across UV seams.
-    """
+    """Starts the measurements of a result in the pool; ``mesh``: the report of the mesh welded across UV seams."""
     return submit(lambda: {"mesh": asdict(report(mesh)), "mask_iou": mask_iou(scene, views)}, mesh.vertices.device)
 
 

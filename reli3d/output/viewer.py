@@ -44,7 +44,7 @@ def viewer_page(
 ) -> str:
     """HTML page of ``meshes``, by name, under ``light (H, 2H, 3)`` and two built-in environments.
 
-    middle ``(3,)``, radius: center and radius of the object, for the camera.  stops: from :func:`photograph_stops`.
+    middle ``(3,)``, radius: of the object, for the camera.  stops: from :func:`photograph_stops`.
     """
     lights = {"estimated light": light, **{k: make().radiance for k, make in LIGHTS.items()}}
     data = {
@@ -70,10 +70,7 @@ def viewer_page(
 
 
 def photograph_stops(views: Views) -> list[dict]:
-    """Camera stops at the input views, in the frame of the meshes.
-
-    Images are downsampled to ``MAX_IMAGE_PIXELS``, with the masks as alpha; intrinsics are those of the scaled image.
-    """
+    """Camera stops at the input views; images are downsampled to ``MAX_IMAGE_PIXELS``, with the masks as alpha."""
     stops = []
     for i in range(len(views)):
         height, width = views.masks[i].shape
@@ -104,10 +101,7 @@ def _base64(data: bytes) -> str:
 
 
 def shadow(mesh: Mesh, scene: RayScene | None = None) -> dict[str, str | float]:
-    """Self-shadowing of every vertex of ``mesh`` as spherical harmonics.
-
-    Deflated, 16 bytes per vertex, in steps of ``largest`` / 127.  scene: rays against the mesh; None: built here.
-    """
+    """Self-shadowing of the vertices as spherical harmonics, deflated, 16 bytes each, in steps of ``largest`` / 127."""
     blocked = blocked_transfer(mesh, scene=scene).cpu()
     largest = float(blocked.abs().amax()) if blocked.numel() else 0.0
     steps = (blocked * (127.0 / max(largest, MIN_TRANSFER))).round().to(torch.int8)

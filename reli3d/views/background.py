@@ -15,10 +15,7 @@ NETWORK = "isnet-general-use"  # Qin and others 2022, Highly accurate dichotomou
 
 
 class Remover:
-    """Segments images, one at a time; the network is loaded with the first image.
-
-    Raises InputError for ``option`` if the network cannot be loaded.
-    """
+    """Segments images, one at a time; loads the network with the first, else raises InputError for ``option``."""
 
     def __init__(self, option: str = "remove-background"):
         self.option, self.network, self.masks = option, NETWORK, 0

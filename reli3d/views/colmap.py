@@ -38,10 +38,7 @@ _MODELS = {
 
 
 def find_colmap(folder: Path) -> list[Path]:
-    """The ``images.txt`` and ``images.bin`` of the models in ``folder``, each with its cameras in the same folder.
-
-    If a model has both, the text file, which users edit, comes first.
-    """
+    """The ``images.txt`` and ``images.bin`` of the models in ``folder``; of both, the text, which users edit, first."""
     places = [at for place in PLACES for at in (sorted(folder.glob(place)) if place else [folder])]
     found = [at / f"images.{ending}" for at in dict.fromkeys(places) for ending in ("txt", "bin")]
     return [path for path in found if os.path.lexists(path) and os.path.lexists(_cameras_of(path))]

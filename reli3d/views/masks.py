@@ -197,10 +197,7 @@ class MaskFiles:
         return None
 
     def of(self, frame: Frame) -> Path | None:
-        """The mask file of ``frame``: in ``folder`` where one is given, its own, or found by name; None without any.
-
-        Raises InputError where it is that of another image as well.
-        """
+        """The mask file of ``frame``: given, its own, or found by name; InputError if it is another image's as well."""
         mask = self._find(frame.image) if self.given or frame.mask is None else frame.mask
         if mask is None:
             return None

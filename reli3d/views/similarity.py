@@ -66,10 +66,7 @@ class Similarity:
 
 
 def output_frame(up: str) -> Similarity:
-    """Transform to the asset frame, whose +Y is the axis ``up`` of the input cameras' frame.
-
-    Raises InputError for an invalid ``up``.
-    """
+    """Transform to the asset frame, whose +Y is the axis ``up`` of the input cameras' frame; else InputError."""
     if up not in UP:
         raise InputError("up", f"expected one of {', '.join(UP)}, got {up}")
     return replace(Similarity.identity(), rotation=torch.tensor(UP[up], dtype=torch.float64, device="cpu"))
