@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from reli3d.geometry.camera import look_at
 from reli3d.io.glb import glb_bytes
 from reli3d.output import results
 from reli3d.output.folder import claimed
 from reli3d.render.asset import Asset
 from reli3d.render.lights import studio
-from reli3d.views.views import Views
+from tests.support.rigs import sphere_views
 from tests.support.scenes import ball_mesh, textures
 
 RECORD = {"output_from_input": [1], "model_from_input": [2], "weights": {"file": "x"}}  # all of it in the mesh's extras
@@ -29,8 +28,7 @@ def asset():
 
 @pytest.fixture
 def views():
-    c2w = look_at(torch.tensor([0.0, 0.0, 3.0]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))[None]
-    return Views((torch.ones(8, 8, 3),), (torch.ones(8, 8),), c2w, torch.tensor([[9.0, 9.0, 4.0, 4.0]]), ("a.png",))
+    return sphere_views(count=1, size=(8, 8))
 
 
 def written(folder, asset, views, **options):
