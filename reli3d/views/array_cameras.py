@@ -67,15 +67,14 @@ def read_neus(folder: Path, path: Path) -> tuple[list[Frame], list[str]]:
         if [m.shape for m in pair] != [(4, 4), (4, 4)]:
             raise InputError(where, "expected a 4x4 array each, got none or another shape; export the cameras again")
         world, scale = (_finite(path, m) for m in pair)
-        focal, (cx, cy), c2w = _decomposed(where, (world @ scale)[:3])
-        lens = Lens(focal=focal, center=(cx + 0.5, cy + 0.5))  # pixel centers at whole numbers there
+        lens, c2w = _decomposed(where, (world @ scale)[:3])
         name, mask = image.relative_to(folder).as_posix(), masks[0][k] if masks else None
         frames.append(Frame(where, name, image, mask, nearest_rigid(where, "rotation", c2w), lens))
     return frames, []
 
 
-def _decomposed(where: str, projection: np.ndarray) -> tuple[tuple[float, float], tuple[float, float], np.ndarray]:
-    """Focal lengths and principal point [px], and camera-to-world ``(4, 4)`` in OpenGL axes, of a ``(3, 4)`` matrix.
+def _decomposed(where: str, projection: np.ndarray) -> tuple[Lens, np.ndarray]:
+    """Lens, and camera-to-world ``(4, 4)`` in OpenGL axes, of a ``(3, 4)`` matrix.
 
     ``projection`` is K [R | t] times any factor but 0, in OpenCV axes.  RQ decomposition of its left 3x3 block (Hartley
     and Zisserman 2004, section 6.2.4).  Raises InputError for a singular block or a skew.
@@ -94,7 +93,7 @@ def _decomposed(where: str, projection: np.ndarray) -> tuple[tuple[float, float]
     c2w[:3, :3] = rotation.T * (1, -1, -1)  # columns y and z turned: OpenCV to OpenGL axes
     c2w[:3, 3] = -np.linalg.solve(block, projection[:, 3])
     (fx, _, cx), (_, fy, cy), _ = upper.tolist()
-    return (fx, fy), (cx, cy), c2w
+    return Lens(focal=(fx, fy), center=(cx + 0.5, cy + 0.5)), c2w  # pixel centers at whole numbers there
 
 
 def _load(path: Path) -> np.ndarray | dict[str, np.ndarray]:
