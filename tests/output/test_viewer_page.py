@@ -26,6 +26,7 @@ from reli3d.render.lights import sky, studio
 from reli3d.render.transfer import spherical_harmonics
 from reli3d.views.views import Views
 from tests.support.browser import chromium, pixels
+from tests.support.example import QUICK
 from tests.support.scenes import ball_mesh, textures
 
 SIZE, WIDE = 192, 336  # the page's window is wider than the photographs
@@ -206,8 +207,8 @@ def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, asset, views, monkeyp
 
 
 def test_the_page_of_the_example_looks_as_its_image_by_the_renderer(tmp_path):
-    """The estimated light from the first photograph, at the command's default sizes."""
-    assert infer.main(["--output", str(tmp_path), "--device", "cpu"]) == 0
+    """The estimated light from the first photograph."""
+    assert infer.main(["--output", str(tmp_path), *QUICK]) == 0
     (part,) = read_glb(tmp_path / "example" / "mesh.glb")
     light = read_environment(tmp_path / "example" / "environment.exr")
     with chromium() as tab:
