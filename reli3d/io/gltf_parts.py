@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reli3d._bridge import present
 from reli3d.errors import InputError
 from reli3d.geometry.mesh import Mesh
 from reli3d.io.gltf import Document, Placed
@@ -77,26 +78,23 @@ class _Primitive:
             position = document.item("accessors", self.attributes["POSITION"], f"{field}.attributes.POSITION")
             if "bufferView" not in position:
                 document.fail(f"{field}.extensions", "expected uncompressed data", DRACO, "export without compression")
-        self.position = self._values("POSITION", self.attributes, ("VEC3",))
+        self.count: int | None = None
+        self.position = present("POSITION", self.read("POSITION", "VEC3"))
+        self.count = len(self.position)
 
     def read(self, name: str, *kinds: str, of: dict | None = None) -> np.ndarray | None:
         """Values of an attribute, or None where the primitive has none; ``of``: of a morph target instead."""
         attributes = self.attributes if of is None else of
         if name not in attributes:
             return None
-        values = self._values(name, attributes, kinds)
-        if len(values) != len(self.position):
-            expected = f"expected {len(self.position)} elements"
-            self.document.fail(f"{self.field}.attributes.{name}", expected, len(values))
-        return values
-
-    def _values(self, name: str, attributes: dict, kinds: tuple[str, ...]) -> np.ndarray:
         field = f"{self.field}.attributes.{name}"
         values = self.document.accessor(attributes[name], field, kinds)
         if values.dtype.kind == "u" and name.startswith(("COLOR", "WEIGHTS")):
             self.document.fail(field, "expected floats or normalized integers", values.dtype.name)
         if values.dtype.kind != "u" and name.startswith("JOINTS"):
             self.document.fail(field, "expected unsigned integers", values.dtype.name)
+        if self.count not in (None, len(values)):
+            self.document.fail(field, f"expected {self.count} elements", len(values))
         return values.astype(np.float64)
 
     def asset(self, placed: Placed, materials: Materials) -> Asset | None:
