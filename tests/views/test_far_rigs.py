@@ -119,10 +119,10 @@ def test_the_mesh_of_far_cameras_is_closed_and_in_its_place(tmp_path):
 
 
 def test_views_that_are_far_in_float32_are_refused_where_the_mesh_would_break():
-    views = load_views(infer.EXAMPLE, views=1)
+    views = load_views(infer.EXAMPLE)
     shift = Similarity.without_rotation(torch.tensor(FARTHEST, dtype=torch.float64))
     with pytest.raises(ValueError, match="views: expected an object near the origin, got one of size"):
-        reconstruct(views.transformed(shift), options=ReconstructOptions(texture_size=256, resolution=24))
+        reconstruct(views.transformed(shift), options=ReconstructOptions(texture_size=256, resolution=40))
 
 
 def test_a_translation_goes_to_the_node_and_back_and_an_export_keeps_the_vertices(tmp_path):
