@@ -1,32 +1,34 @@
 """Cameras of a COLMAP model, as text (``cameras.txt`` and ``images.txt``) or binary (``cameras.bin``, ``images.bin``).
 
 COLMAP stores world-to-camera rotations (w, x, y, z) and translations in OpenCV axes (+Y down, looking along +Z); they
-are converted to camera-to-world in OpenGL axes.  COLMAP's pixel centers are at +0.5 too.  Source:
-https://colmap.github.io/format.html and the list of camera models there.
+are converted to camera-to-world in OpenGL axes.  COLMAP's pixel centers are at +0.5 too.  Binary files are
+little-endian, without alignment.  Source: https://colmap.github.io/format.html and the list of camera models there.
 """
 
 import math
 import os
 import re
+import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path, PurePath
+from typing import BinaryIO
 
 import numpy as np
 
 from reli3d.errors import InputError, shown
 from reli3d.io.files import file_size, opened
 from reli3d.io.gltf import rotation_of
-from reli3d.views import colmap_binary
 from reli3d.views.file_names import FolderIndex, images_below, images_in
-from reli3d.views.frames import Frame, Lens, file_within, nearest_rigid, number
+from reli3d.views.frames import MAX_PATH, Frame, Lens, file_within, nearest_rigid, number
 
 MAX_BYTES = 1 << 28  # images.txt lists every matched point
 MAX_LINE = 1 << 24  # an image's points: 30 characters each
 MAX_IMAGES = 100_000
 PLACES = ("sparse/0", "sparse", "sparse/*", "colmap/sparse/0", "colmap/sparse", "colmap/sparse/*", "")
 _POINTS = re.compile(r"(?:[-+.0-9eE]+\s+[-+.0-9eE]+\s+-?\d+(?:\s+|$))+")  # x, y, number of the 3D point or -1
+_POINT = 24  # bytes of a point in a binary file
 # model: numbers of focal lengths, radial and tangential parameters; the principal point follows the focal lengths
 _MODELS = {
     "SIMPLE_PINHOLE": (1, 0, 0),
@@ -35,6 +37,10 @@ _MODELS = {
     "RADIAL": (1, 2, 0),
     "OPENCV": (2, 2, 2),
 }
+_NAMES = (  # in the order of their numbers
+    *(*_MODELS, "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
+)
 
 
 def find_colmap(folder: Path) -> list[Path]:
@@ -65,7 +71,7 @@ def read_colmap(folder: Path, models: Sequence[Path]) -> tuple[list[Frame], list
     if not entries[best]:
         raise InputError(path, "expected at least one image, got none; export the model again")
     cameras = _cameras_of(path)
-    lenses = _lenses(_text_cameras(cameras) if path.suffix == ".txt" else colmap_binary.cameras(cameras))
+    lenses = _lenses(_text_cameras(cameras) if path.suffix == ".txt" else _binary_cameras(cameras))
     if not lenses:
         raise InputError(cameras, "expected at least one camera, got none; export the model again")
     index, listed = FolderIndex(), [PurePath(name) for name, *_ in entries[best]]
@@ -107,7 +113,7 @@ def _counted(folder: Path, images: Path, frames: list[Frame], missing: list[str]
 
 def _entries(path: Path) -> list[tuple]:
     """``(name, where, pose, camera)`` of each image."""
-    read = _text_images if path.suffix == ".txt" else colmap_binary.images
+    read = _text_images if path.suffix == ".txt" else _binary_images
     entries = list(islice(read(path), MAX_IMAGES + 1))
     if len(entries) > MAX_IMAGES:
         raise InputError(path, f"expected at most {MAX_IMAGES} images; export the views to be used")
@@ -145,8 +151,6 @@ def _text_cameras(path: Path) -> Iterator[tuple[str, str, str, list[float], list
         where, words = f"{path}: line {n}", line.split()
         if len(words) < 5:
             raise InputError(where, f"expected ID, model, width, height, parameters, got {shown(line)}; export again")
-        if words[1] not in _MODELS:
-            raise colmap_binary.no_pinhole(where, words[1], _MODELS)
         size = [_real(where, field, v) for field, v in zip(("WIDTH", "HEIGHT"), words[2:4])]
         yield where, words[0], words[1], size, [_real(where, "PARAMS", v) for v in words[4:]]
 
@@ -156,6 +160,9 @@ def _lenses(cameras: Iterator) -> dict[object, Lens]:
     for where, key, model, size, values in cameras:
         if key in lenses:
             raise InputError(where, f"CAMERA_ID: expected every camera once, got {shown(key)} twice; export it again")
+        if model not in _MODELS:
+            expected = f"expected {', '.join(_MODELS)}, got {shown(model)}"
+            raise InputError(where, f"MODEL: {expected}; run colmap image_undistorter first")
         focals, radial, tangential = _MODELS[model]
         if len(values) != (count := focals + 2 + radial + tangential):
             raise InputError(where, f"PARAMS: expected {count} numbers for {model}, got {len(values)}; export it again")
@@ -196,3 +203,66 @@ def _lines(path: Path):
                     yield n, line
     except UnicodeDecodeError:
         raise InputError(path, "expected UTF-8 text, got other bytes; export the model again") from None
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[str, int, str, list[float], list[float]]]:
+    """See :func:`_text_cameras`."""
+    with opened(path) as content:
+        file = _Entries(path, content)
+        for where in file.each():
+            key, model, *size = file.take("<IiQQ")
+            name = _NAMES[model] if 0 <= model < len(_NAMES) else f"number {model}"
+            count = sum(_MODELS[name]) + 2 if name in _MODELS else 0  # others are refused
+            yield where, key, name, size, list(file.take(f"<{count}d"))
+
+
+def _binary_images(path: Path) -> Iterator[tuple[str, str, list[float], int]]:
+    """See :func:`_entries`."""
+    with opened(path) as content:
+        file = _Entries(path, content)
+        for where in file.each():
+            _, *pose, camera = file.take("<I7dI")
+            name = file.text()
+            file.skip(file.take("<Q")[0] * _POINT)
+            yield name, where, pose, camera
+
+
+class _Entries:
+    """A file that begins with the number of its entries; nothing is read beyond its end."""
+
+    def __init__(self, path: Path, file: BinaryIO):
+        self.path, self.file, self.size, self.where = path, file, file_size(path), str(path)
+
+    def each(self) -> Iterator[str]:
+        """Names of the entries for messages, as many as the file declares."""
+        for k in range(self.take("<Q")[0]):
+            self.where = f"{self.path}: entry {k}"
+            yield self.where
+
+    def take(self, layout: str) -> tuple:
+        data = self.file.read(struct.calcsize(layout))
+        if len(data) < struct.calcsize(layout):
+            self._short()
+        return struct.unpack(layout, data)
+
+    def skip(self, count: int) -> None:
+        if count > self.size - self.file.tell():
+            self._short()
+        self.file.seek(count, 1)
+
+    def text(self) -> str:
+        """The bytes up to the next NUL, which are UTF-8."""
+        start = self.file.tell()
+        data, end, _ = self.file.read(4 * MAX_PATH + 1).partition(b"\0")
+        if not end:
+            expected = f"expected a name of at most {4 * MAX_PATH} bytes"
+            raise InputError(self.where, f"NAME: {expected}, got no end of it; export the model again")
+        self.file.seek(start + len(data) + 1)
+        try:
+            return data.decode("utf-8")
+        except UnicodeDecodeError:
+            raise InputError(self.where, "NAME: expected UTF-8, got other bytes; export the model again") from None
+
+    def _short(self):
+        expected = f"expected more than the {self.size} bytes of the file"
+        raise InputError(self.where, f"{expected}; it is cut off or no COLMAP model, export it again")
