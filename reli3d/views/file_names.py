@@ -25,9 +25,10 @@ class FolderIndex:
         at = Path(folder)
         for part in relative.parts:
             if at not in self._names:
-                self._names[at] = found = defaultdict(list)
+                found: dict[str, list[str]] = defaultdict(list)
                 for name in _listed(at):
                     found[_key(name)].append(name)
+                self._names[at] = found  # complete: other threads read it
             names = self._names[at].get(_key(part), [])
             if part in names:
                 at = at / part
