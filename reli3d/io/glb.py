@@ -80,19 +80,18 @@ def check_asset(asset: Asset) -> None:
     mesh = asset.mesh
     if len(mesh.faces) == 0:
         raise ValueError("asset.mesh.faces: expected at least one face, got 0")
-    for name, fix in (("normals", "Mesh.with_normals"), ("uv", "unwrap"), ("tangents", "Mesh.with_tangents")):
-        if getattr(mesh, name) is None:
+    fixes = {"vertices": "", "normals": "Mesh.with_normals", "uv": "unwrap", "tangents": "Mesh.with_tangents"}
+    for name, fix in fixes.items():
+        value = getattr(mesh, name)
+        if value is None:
             raise ValueError(f"asset.mesh.{name}: expected a tensor, got None (see {fix})")
-    for name in ("vertices", "normals", "uv", "tangents"):
-        if not bool(torch.isfinite(getattr(mesh, name)).all()):
+        if not bool(torch.isfinite(value).all()):
             raise ValueError(f"asset.mesh.{name}: expected finite values, got NaN or infinity")
-    normals, tangents = present("normals", mesh.normals), present("tangents", mesh.tangents)
-    for name, value in (("normals", normals), ("tangents", tangents[:, :3])):
-        length = value.detach().norm(dim=1)
-        worst = float((length - 1.0).abs().max())
-        if worst > UNIT_TOLERANCE:
-            raise ValueError(f"asset.mesh.{name}: expected unit length, got a length off by {worst:.3g}")
-    if not bool((tangents[:, 3].abs() == 1.0).all()):
+        if name in ("normals", "tangents"):
+            worst = float((value.detach()[:, :3].norm(dim=1) - 1.0).abs().max())
+            if worst > UNIT_TOLERANCE:
+                raise ValueError(f"asset.mesh.{name}: expected unit length, got a length off by {worst:.3g}")
+    if not bool((present("tangents", mesh.tangents)[:, 3].abs() == 1.0).all()):
         raise ValueError("asset.mesh.tangents: expected w = +1 or -1, got another value")
     for name in ("base_color", "roughness", "metallic", "normal"):
         value = getattr(asset.textures, name)
