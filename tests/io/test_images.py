@@ -175,10 +175,8 @@ def test_a_linear_image_is_encoded_by_its_suffix(tmp_path):
     [
         ("a.jpg", torch.ones(4, 4, 3), "path: expected"),
         ("a.hdr", torch.ones(4, 4, 4), "image: expected shape"),
-        ("a.png", torch.ones(4, 4, 2), "image: expected shape"),
-        ("a.exr", torch.ones(0, 4, 3), "image: expected shape"),
+        ("a.exr", torch.ones(0, 4, 2), "image: expected shape"),
         ("a.png", torch.full((4, 4, 3), math.nan), "image: expected finite"),
-        ("a.hdr", torch.full((4, 4, 3), -1.0), "image: expected finite"),
         ("a.exr", torch.full((4, 4, 3), math.inf), "image: expected finite"),
     ],
 )

@@ -125,10 +125,7 @@ REFUSED = {
     "two DAVIS entries": (lambda: palette(DISK + 1 * (np.arange(SIDE) > 23) * DISK, DAVIS), "(0, 128, 0), (128, 0, 0)"),
     "16-bit labels": (lambda: (DISK * (300 + 7 * (np.arange(SIDE) > 23))).astype(np.uint16), "0, 300, 307"),
     "colored background": (lambda: np.where(DISK[..., None], (255, 0, 0), 255).astype(np.uint8), "(255, 255, 255)"),
-    "a photograph": (
-        lambda: np.random.default_rng(0).integers(0, 255, (SIDE, SIDE, 3), dtype=np.uint8),
-        "colors",
-    ),
+    "a photograph": (lambda: np.random.default_rng(0).integers(0, 255, (SIDE, SIDE, 3), dtype=np.uint8), "colors"),
 }
 
 
