@@ -19,16 +19,10 @@ MAX_SAMPLES = 1 << 27  # 8192 x 4096 with four channels
 MAX_ATTRIBUTES = 256  # a rendering with every metadata field has about 60; OpenEXR takes quadratic time
 MAX_CHANNEL_BYTES = 4096  # of the channel list: at least 100 channels; again quadratic time
 _LINES = {  # scanlines in a chunk
-    OpenEXR.NO_COMPRESSION: 1,
-    OpenEXR.RLE_COMPRESSION: 1,
-    OpenEXR.ZIPS_COMPRESSION: 1,
-    OpenEXR.ZIP_COMPRESSION: 16,
-    OpenEXR.PXR24_COMPRESSION: 16,
-    OpenEXR.PIZ_COMPRESSION: 32,
-    OpenEXR.B44_COMPRESSION: 32,
-    OpenEXR.B44A_COMPRESSION: 32,
-    OpenEXR.DWAA_COMPRESSION: 32,
-    OpenEXR.DWAB_COMPRESSION: 256,
+    **dict.fromkeys((OpenEXR.NO_COMPRESSION, OpenEXR.RLE_COMPRESSION, OpenEXR.ZIPS_COMPRESSION), 1),
+    **dict.fromkeys((OpenEXR.ZIP_COMPRESSION, OpenEXR.PXR24_COMPRESSION), 16),
+    **dict.fromkeys((OpenEXR.PIZ_COMPRESSION, OpenEXR.B44_COMPRESSION, OpenEXR.B44A_COMPRESSION), 32),
+    **{OpenEXR.DWAA_COMPRESSION: 32, OpenEXR.DWAB_COMPRESSION: 256},
 }
 _PRIMARIES = {  # of colorInteropID (Color Interop Forum) without chromaticities
     "lin_rec709_scene": (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290),

@@ -8,9 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from reli3d.errors import InputError, printable, shown
-
-__all__ = ["InputError", "file_size", "opened", "printable", "read_bytes", "replacing", "shown", "write_bytes"]
+from reli3d.errors import InputError
 
 
 def read_bytes(path: str | os.PathLike, limit: int) -> bytes:
@@ -59,8 +57,7 @@ def replacing(path: str | os.PathLike):
     path = Path(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, "the folder does not exist", str(path.parent))
-    # short: no file system cuts it
-    temporary = path.with_name(f".{os.getpid()}.{os.urandom(4).hex()}{path.suffix[-8:]}")
+    temporary = path.with_name(f".{os.getpid()}.{os.urandom(4).hex()}{path.suffix[-8:]}")  # short: none cuts it
     try:
         yield temporary
         os.replace(temporary, path)

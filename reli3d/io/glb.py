@@ -47,9 +47,9 @@ def texture_images(asset: Asset, kind: str = "png") -> dict[str, bytes]:
     rough = asset.textures.roughness
     orm = torch.stack([torch.ones_like(rough), rough, asset.textures.metallic], -1)  # no occlusion is baked
     base_color = linear_to_srgb(asset.textures.base_color)
-    maps = {"base_color": base_color, "metallic_roughness": orm, "normal": asset.textures.normal}
-    values = list(maps.values())
-    return dict(zip(maps, over_rows(len(values), 1, lambda k, _: encode_image(values[k], kind)), strict=True))
+    maps = (base_color, orm, asset.textures.normal)
+    encoded = over_rows(len(maps), 1, lambda k, _: encode_image(maps[k], kind))
+    return dict(zip(("base_color", "metallic_roughness", "normal"), encoded, strict=True))
 
 
 def addressing(asset: Asset) -> tuple[str, str]:
@@ -80,19 +80,18 @@ def check_asset(asset: Asset) -> None:
     mesh = asset.mesh
     if len(mesh.faces) == 0:
         raise ValueError("asset.mesh.faces: expected at least one face, got 0")
-    for name, fix in (("normals", "Mesh.with_normals"), ("uv", "unwrap"), ("tangents", "Mesh.with_tangents")):
-        if getattr(mesh, name) is None:
+    fixes = {"vertices": "", "normals": "Mesh.with_normals", "uv": "unwrap", "tangents": "Mesh.with_tangents"}
+    for name, fix in fixes.items():
+        value = getattr(mesh, name)
+        if value is None:
             raise ValueError(f"asset.mesh.{name}: expected a tensor, got None (see {fix})")
-    for name in ("vertices", "normals", "uv", "tangents"):
-        if not bool(torch.isfinite(getattr(mesh, name)).all()):
+        if not bool(torch.isfinite(value).all()):
             raise ValueError(f"asset.mesh.{name}: expected finite values, got NaN or infinity")
-    normals, tangents = present("normals", mesh.normals), present("tangents", mesh.tangents)
-    for name, value in (("normals", normals), ("tangents", tangents[:, :3])):
-        length = value.detach().norm(dim=1)
-        worst = float((length - 1.0).abs().max())
-        if worst > UNIT_TOLERANCE:
-            raise ValueError(f"asset.mesh.{name}: expected unit length, got a length off by {worst:.3g}")
-    if not bool((tangents[:, 3].abs() == 1.0).all()):
+        if name in ("normals", "tangents"):
+            worst = float((value.detach()[:, :3].norm(dim=1) - 1.0).abs().max())
+            if worst > UNIT_TOLERANCE:
+                raise ValueError(f"asset.mesh.{name}: expected unit length, got a length off by {worst:.3g}")
+    if not bool((present("tangents", mesh.tangents)[:, 3].abs() == 1.0).all()):
         raise ValueError("asset.mesh.tangents: expected w = +1 or -1, got another value")
     for name in ("base_color", "roughness", "metallic", "normal"):
         value = getattr(asset.textures, name)
@@ -126,6 +125,10 @@ def glb_bytes(
         view = {"buffer": 0, "byteOffset": offset, "byteLength": len(chunk)}
         views.append({**view, "target": targets[k]} if k < len(targets) else view)
         offset += len(chunk) + -len(chunk) % 4
+
+    def source(image: int) -> dict:  # a viewer that does not know the extension finds none
+        return {"source": image} if textures == "png" else {"extensions": {WEBP: {"source": image}}}
+
     info: dict[str, object] = {"version": "2.0", "generator": f"reli3d {reli3d.__version__}"}
     if extras:
         info["extras"] = dict(extras)
@@ -148,7 +151,7 @@ def glb_bytes(
                 "doubleSided": bool(double_sided),
             }
         ],
-        "textures": [{"sampler": 0, "name": name, **_source(k, textures)} for k, name in enumerate(names)],
+        "textures": [{"sampler": 0, "name": name, **source(k)} for k, name in enumerate(names)],
         "images": [
             {"bufferView": len(targets) + k, "mimeType": f"image/{textures}", "name": name}
             for k, name in enumerate(names)
@@ -173,11 +176,6 @@ def glb_bytes(
     for chunk in chunks:
         parts += [chunk, b"\0" * (-len(chunk) % 4)]
     return b"".join(parts)
-
-
-def _source(image: int, kind: str) -> dict:
-    """Where a texture finds its image; a viewer that does not know the extension finds none."""
-    return {"source": image} if kind == "png" else {"extensions": {WEBP: {"source": image}}}
 
 
 def _geometry(mesh) -> tuple[dict, list[bytes]]:

@@ -139,11 +139,8 @@ class Materials:
         self.document.note(f"{field}: textures of different transforms or wrap modes are resampled to one layout")
         center = (np.arange(size) + 0.5) / size
         uv = np.stack(np.meshgrid(center, center), -1).reshape(-1, 2) * span + low
-        maps: list[Tensor | None] = []
-        for k, slot in enumerate(material.slots):
-            if slot is None:
-                maps.append(None)
-                continue
+
+        def resampled(k: int, slot: _Slot) -> Tensor:
             image = material.decoded(k)
             height, width = image.shape[:2]
             at = np.array(slot.layout.apply(uv))
@@ -152,7 +149,9 @@ class Materials:
             place = wrap_uv(torch.from_numpy(at).float(), slot.layout.wrap, (width, height))
             color = sample_texture(image[..., :3].contiguous(), place)
             alpha = sample_texture(image[..., 3:].expand(-1, -1, 3).contiguous(), place)
-            maps.append(torch.cat([color, alpha[:, :1]], 1).reshape(size, size, 4))
+            return torch.cat([color, alpha[:, :1]], 1).reshape(size, size, 4)
+
+        maps = [None if s is None else resampled(k, s) for k, s in enumerate(material.slots)]
         return self._make(material, maps, size, ("clamp", "clamp"))
 
     def _count(self, size: int, field: str) -> None:
@@ -182,57 +181,57 @@ class Materials:
     def _parse(self, material: dict, field: str) -> _Material:
         get, numbers, leave_out = self.document.get, self.document.numbers, self.document.leave_out
         extensions = self.document.extensions(material, field)
-        if get(material, "alphaMode", str, f"{field}.alphaMode", "OPAQUE") != "OPAQUE":
+        if get(material, "alphaMode", str, field, "OPAQUE") != "OPAQUE":
             leave_out("alpha")
-        if any(numbers(material, "emissiveFactor", 3, f"{field}.emissiveFactor", [0, 0, 0])):
+        if any(numbers(material, "emissiveFactor", 3, field, [0, 0, 0])):
             leave_out("emission")
         if "occlusionTexture" in material:
             leave_out("occlusionTexture")
         normal = self._slot(material, "normalTexture", field)
         scale = 1.0
         if normal is not None:
-            scale = get(material["normalTexture"], "scale", float, f"{field}.normalTexture.scale", 1.0)
+            scale = get(material["normalTexture"], "scale", float, f"{field}.normalTexture", 1.0)
             if abs(scale) > MAX_SCALE:
                 self.document.fail(f"{field}.normalTexture.scale", f"expected at most {MAX_SCALE:g}", scale)
         if SPECULAR_GLOSSINESS in extensions:
             self.document.note(f"{SPECULAR_GLOSSINESS} is converted to metallic and roughness")
             where = f"{field}.extensions.{SPECULAR_GLOSSINESS}"
-            gloss = get(extensions, SPECULAR_GLOSSINESS, dict, where)
+            gloss = get(extensions, SPECULAR_GLOSSINESS, dict, f"{field}.extensions")
             names = "diffuseTexture", "specularGlossinessTexture"
             return _Material(
-                numbers(gloss, "diffuseFactor", 4, f"{where}.diffuseFactor", [1, 1, 1, 1])[:3],
+                numbers(gloss, "diffuseFactor", 4, where, [1, 1, 1, 1])[:3],
                 scale,
                 [*(self._slot(gloss, name, where) for name in names), normal],
-                specular=numbers(gloss, "specularFactor", 3, f"{where}.specularFactor", [1, 1, 1]),
-                glossiness=get(gloss, "glossinessFactor", float, f"{where}.glossinessFactor", 1.0),
+                specular=numbers(gloss, "specularFactor", 3, where, [1, 1, 1]),
+                glossiness=get(gloss, "glossinessFactor", float, where, 1.0),
             )
         where = f"{field}.pbrMetallicRoughness"
-        pbr = get(material, "pbrMetallicRoughness", dict, where, {})
+        pbr = get(material, "pbrMetallicRoughness", dict, field, {})
         return _Material(
-            numbers(pbr, "baseColorFactor", 4, f"{where}.baseColorFactor", [1, 1, 1, 1])[:3],
+            numbers(pbr, "baseColorFactor", 4, where, [1, 1, 1, 1])[:3],
             scale,
             [self._slot(pbr, "baseColorTexture", where), self._slot(pbr, "metallicRoughnessTexture", where), normal],
-            get(pbr, "roughnessFactor", float, f"{where}.roughnessFactor", 1.0),
-            get(pbr, "metallicFactor", float, f"{where}.metallicFactor", 1.0),
+            get(pbr, "roughnessFactor", float, where, 1.0),
+            get(pbr, "metallicFactor", float, where, 1.0),
         )
 
     def _slot(self, node: dict, key: str, place: str) -> _Slot | None:
         if key not in node:
             return None
         get, document, field = self.document.get, self.document, f"{place}.{key}"
-        info = get(node, key, dict, field)
-        channel = get(info, "texCoord", int, f"{field}.texCoord", 0)
+        info = get(node, key, dict, place)
+        channel = get(info, "texCoord", int, field, 0)
         transform = _IDENTITY
         extensions = document.extensions(info, field)
         if "KHR_texture_transform" in extensions:
             where = f"{field}.extensions.KHR_texture_transform"
-            change = get(extensions, "KHR_texture_transform", dict, where)
-            x, y = document.numbers(change, "offset", 2, f"{where}.offset", [0, 0])
-            sx, sy = document.numbers(change, "scale", 2, f"{where}.scale", [1, 1])
-            turn = get(change, "rotation", float, f"{where}.rotation", 0.0)
+            change = get(extensions, "KHR_texture_transform", dict, f"{field}.extensions")
+            x, y = document.numbers(change, "offset", 2, where, [0, 0])
+            sx, sy = document.numbers(change, "scale", 2, where, [1, 1])
+            turn = get(change, "rotation", float, where, 0.0)
             c, s = math.cos(turn), math.sin(turn)
             transform = (c * sx, s * sy, x, -s * sx, c * sy, y)  # counter-clockwise as seen, where v is down
-            channel = get(change, "texCoord", int, f"{where}.texCoord", channel)
+            channel = get(change, "texCoord", int, where, channel)
         texture = document.item("textures", info.get("index"), f"{field}.index")
         where = f"textures[{info['index']}]"
         fallbacks = ("KHR_texture_basisu", "MSFT_texture_dds", "EXT_texture_avif") if "source" in texture else ()
@@ -241,11 +240,11 @@ class Materials:
         sampler: dict = {}
         if "sampler" in texture:
             sampler = document.item("samplers", texture["sampler"], f"{where}.sampler")
-        modes = [get(sampler, name, int, f"{where}.sampler.{name}", 10497) for name in ("wrapS", "wrapT")]
+        modes = [get(sampler, name, int, f"{where}.sampler", 10497) for name in ("wrapS", "wrapT")]
         for mode in modes:
             if mode not in WRAPS:
                 document.fail(f"{where}.sampler", f"expected wrap modes {sorted(WRAPS)}", mode)
-        if get(sampler, "magFilter", int, f"{where}.sampler.magFilter", 0) in NEAREST:
+        if get(sampler, "magFilter", int, f"{where}.sampler", 0) in NEAREST:
             document.leave_out("filtering by the nearest texel")
         return _Slot(image, _Layout(channel, transform, (WRAPS[modes[0]], WRAPS[modes[1]])))
 
@@ -258,7 +257,7 @@ class Materials:
         if "bufferView" in entry:
             data = bytes(self.document.view(entry["bufferView"], f"{where}.bufferView")[0])
         else:
-            data = self.document.data_uri(self.document.get(entry, "uri", str, f"{where}.uri"), f"{where}.uri")
+            data = self.document.data_uri(entry, where)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -275,10 +274,9 @@ class Materials:
         except InputError:
             raise
         except Exception as error:  # on a broken file decoders raise almost anything: struct.error, IndexError ...
-            raise InputError(
-                self.document.path,
-                f"{where}: expected a PNG, JPEG or WebP image, got {shown(str(error))}; save the image again",
-            ) from None
+            got = shown(str(error))
+            path, expected = self.document.path, "expected a PNG, JPEG or WebP image"
+            raise InputError(path, f"{where}: {expected}, got {got}; save the image again") from None
         self.images[index] = torch.from_numpy(pixels)
         return self.images[index]
 

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reli3d._bridge import present
 from reli3d.errors import InputError
 from reli3d.geometry.mesh import Mesh
 from reli3d.io.gltf import Document, Placed
@@ -34,7 +35,7 @@ def read_parts(
     materials = Materials(document, max_pixels)
     parts, vertices = [], 0
     placed = document.placed_meshes(origin)
-    count = sum(len(document.get(p.mesh, "primitives", list, f"{p.name}.primitives")) for p in placed)
+    count = sum(len(document.get(p.mesh, "primitives", list, p.name)) for p in placed)
     if count > MAX_PARTS:
         document.fail("meshes", f"expected at most {MAX_PARTS} primitives as placed", count, "join the meshes")
     for mesh in placed:
@@ -47,9 +48,8 @@ def read_parts(
                 parts.append(part)
                 vertices += len(part.mesh.vertices)
                 if vertices > max_vertices:
-                    document.fail(
-                        field, f"expected at most {max_vertices} vertices in all", vertices, "simplify the mesh"
-                    )
+                    expected = f"expected at most {max_vertices} vertices in all"
+                    document.fail(field, expected, vertices, "simplify the mesh")
     if not parts:
         raise InputError(path, "expected triangles in its scene, got none; export a mesh")
     if notes is not None:
@@ -58,18 +58,12 @@ def read_parts(
 
 
 def has_material_maps(path: str | os.PathLike) -> bool:
-    """Whether a material of the file has a metallic-roughness texture.
-
-    Without one, roughness and metallic are two numbers, which exporters write as defaults.  Raises InputError as
-    :func:`read_parts` does.
-    """
-    document = Document(path, max_bytes=1 << 29, max_vertices=20_000_000)
-    for k in range(len(document.get(document.json, "materials", list, "materials", []))):
-        material = document.item("materials", k, f"materials[{k}]")
-        pbr = document.get(material, "pbrMetallicRoughness", dict, f"materials[{k}].pbrMetallicRoughness", {})
-        if "metallicRoughnessTexture" in pbr:
-            return True
-    return False
+    """Whether a material has a metallic-roughness texture, not two numbers, which exporters write as defaults."""
+    document = Document(path)
+    count = len(document.get(document.json, "materials", list, "", []))
+    materials = ((f"materials[{k}]", document.item("materials", k, f"materials[{k}]")) for k in range(count))
+    factors = (document.get(material, "pbrMetallicRoughness", dict, where, {}) for where, material in materials)
+    return any("metallicRoughnessTexture" in pbr for pbr in factors)
 
 
 class _Primitive:
@@ -77,34 +71,30 @@ class _Primitive:
 
     def __init__(self, document: Document, primitive: dict, field: str):
         self.document, self.primitive, self.field = document, primitive, field
-        self.attributes = document.get(primitive, "attributes", dict, f"{field}.attributes")
+        self.attributes = document.get(primitive, "attributes", dict, field)
         if "POSITION" not in self.attributes:
             document.fail(f"{field}.attributes", "expected POSITION", sorted(self.attributes))
         if DRACO in document.extensions(primitive, field, DRACO):  # attributes with data are its fallback
             position = document.item("accessors", self.attributes["POSITION"], f"{field}.attributes.POSITION")
             if "bufferView" not in position:
                 document.fail(f"{field}.extensions", "expected uncompressed data", DRACO, "export without compression")
-        self.position = self._values("POSITION", self.attributes, ("VEC3",))
+        self.count: int | None = None
+        self.position = present("POSITION", self.read("POSITION", "VEC3"))
+        self.count = len(self.position)
 
     def read(self, name: str, *kinds: str, of: dict | None = None) -> np.ndarray | None:
         """Values of an attribute, or None where the primitive has none; ``of``: of a morph target instead."""
         attributes = self.attributes if of is None else of
         if name not in attributes:
             return None
-        values = self._values(name, attributes, kinds)
-        if len(values) != len(self.position):
-            self.document.fail(
-                f"{self.field}.attributes.{name}", f"expected {len(self.position)} elements", len(values)
-            )
-        return values
-
-    def _values(self, name: str, attributes: dict, kinds: tuple[str, ...]) -> np.ndarray:
         field = f"{self.field}.attributes.{name}"
         values = self.document.accessor(attributes[name], field, kinds)
         if values.dtype.kind == "u" and name.startswith(("COLOR", "WEIGHTS")):
             self.document.fail(field, "expected floats or normalized integers", values.dtype.name)
         if values.dtype.kind != "u" and name.startswith("JOINTS"):
             self.document.fail(field, "expected unsigned integers", values.dtype.name)
+        if self.count not in (None, len(values)):
+            self.document.fail(field, f"expected {self.count} elements", len(values))
         return values.astype(np.float64)
 
     def asset(self, placed: Placed, materials: Materials) -> Asset | None:
@@ -157,7 +147,7 @@ class _Primitive:
     def _morphed(self, weights: list[float]) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
         """Position, normal and tangent with the morph targets at their default weights."""
         position, normal, tangent = self.position, self.read("NORMAL", "VEC3"), self.read("TANGENT", "VEC4")
-        targets = self.document.get(self.primitive, "targets", list, f"{self.field}.targets", [])
+        targets = self.document.get(self.primitive, "targets", list, self.field, [])
         for target, weight in zip(targets, weights):
             if weight == 0.0:
                 continue

@@ -8,6 +8,7 @@ Writing raises an error for NaN and negative values; infinity and, in half preci
 """
 
 import os
+from collections.abc import Sequence
 
 import numpy as np
 import OpenEXR
@@ -124,14 +125,22 @@ def write_hdr(path: str | os.PathLike, image: Tensor) -> int:
     return clamped
 
 
-def _writable(image: Tensor, limit: float, layouts: tuple[tuple[int, ...], ...] = ((3,),)) -> tuple[np.ndarray, int]:
+def check_linear(image: Tensor, layouts: Sequence[tuple[int, ...]], *, finite: bool = False) -> None:
+    """Raises TypeError unless float32, ValueError unless ``(H, W, *layout)``, not negative and (``finite``) finite."""
     if not isinstance(image, Tensor) or image.dtype != torch.float32:
-        raise TypeError(f"image: expected a float32 tensor, got {getattr(image, 'dtype', type(image).__name__)}")
+        got = image.dtype if isinstance(image, Tensor) else type(image).__name__
+        raise TypeError(f"image: expected a float32 tensor, as Render.rgba, got {got}")
     if image.ndim < 2 or image.shape[2:] not in layouts or image.numel() == 0:
         expected = " or ".join(f"(H, W{''.join(f', {n}' for n in layout)})" for layout in layouts)
         raise ValueError(f"image: expected shape {expected}, got {tuple(image.shape)}")
+    valid = (image >= 0.0) & (image.isfinite() if finite else True)
+    if not bool(valid.all()):
+        expected = "finite values >= 0" if finite else "values >= 0"
+        raise ValueError(f"image: expected {expected}, got others at {int((~valid).sum())} places")
+
+
+def _writable(image: Tensor, limit: float, layouts: Sequence[tuple[int, ...]] = ((3,),)) -> tuple[np.ndarray, int]:
+    check_linear(image, layouts)
     pixels = image.detach().cpu().numpy()
-    if np.isnan(pixels).any() or (pixels < 0).any():
-        raise ValueError(f"image: expected values >= 0, got NaN or negative at {int((~(pixels >= 0)).sum())} places")
     over = pixels > limit
     return np.ascontiguousarray(np.where(over, np.float32(HALF_MAX), pixels)), int(over.sum())

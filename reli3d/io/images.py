@@ -21,7 +21,7 @@ from torch import Tensor
 
 from reli3d.errors import InputError, printable, shown
 from reli3d.io.files import file_size, write_bytes
-from reli3d.io.hdr import write_exr, write_hdr
+from reli3d.io.hdr import check_linear, write_exr, write_hdr
 from reli3d.render.color import linear_to_srgb
 
 MAX_PIXELS = 1 << 26  # 64 MP: 256 MiB of RGBA, above any camera this is meant for
@@ -291,16 +291,8 @@ def write_image(path: str | os.PathLike, image: Tensor) -> None:
     suffix = os.path.splitext(path)[1].lower()
     if suffix not in (".png", ".exr", ".hdr"):
         raise ValueError(f"path: expected a name that ends in .png, .exr or .hdr, got {shown(os.path.basename(path))}")
-    if not isinstance(image, Tensor) or image.dtype != torch.float32:
-        got = image.dtype if isinstance(image, Tensor) else type(image).__name__
-        raise TypeError(f"image: expected a float32 tensor, as Render.rgba, got {got}")
-    layouts = [(3,)] if suffix == ".hdr" else [(), (3,), (4,)]
-    if image.ndim < 2 or image.shape[2:] not in layouts or image.numel() == 0:
-        expected = "(H, W, 3)" if suffix == ".hdr" else "(H, W), (H, W, 3) or (H, W, 4)"
-        raise ValueError(f"image: expected shape {expected}, got {tuple(image.shape)}")
+    check_linear(image, [(3,)] if suffix == ".hdr" else [(), (3,), (4,)], finite=True)
     image = image.detach()
-    if not bool((torch.isfinite(image) & (image >= 0.0)).all()):
-        raise ValueError("image: expected finite values >= 0, got NaN, infinity or negative values")
     if suffix == ".hdr":
         write_hdr(path, image)
     elif suffix == ".exr":

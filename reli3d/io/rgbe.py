@@ -4,6 +4,7 @@ A pixel is three mantissas and a common exponent: value = mantissa / 256 * 2 ** 
 Real Pixels, Graphics Gems II (1991); Radiance's "File Formats" (https://radsite.lbl.gov/radiance/refer/filefmts.pdf).
 """
 
+import contextlib
 import os
 
 import numpy as np
@@ -55,37 +56,34 @@ def _variables(path, data: bytes, notes: list[str]) -> tuple[np.ndarray, np.ndar
         end = data.find(b"\n", at, MAX_HEADER)
         if end < 0:
             raise InputError(path, "header: expected an empty line and a resolution line, got neither; save it again")
-        line, at = data[at:end].rstrip(b"\r"), end + 1
+        line, at = data[at:end].rstrip(b"\r").decode("latin-1"), end + 1
         if not line:
             return factor, matrix, at
-        key, _, value = line.partition(b"=")  # an indented line is the header of an image that this was derived from
-        if key == b"FORMAT" and value.strip() != b"32-bit_rle_rgbe":
-            got = shown(value.decode("latin-1"))
-            raise InputError(path, f"FORMAT: expected 32-bit_rle_rgbe, got {got}; convert it with ra_xyze -r")
-        if key in (b"EXPOSURE", b"COLORCORR"):
-            factor = factor * _positive(path, key.decode(), value, 1 if key == b"EXPOSURE" else 3)
-        elif key in (b"PIXASPECT", b"GAMMA") and _positive(path, key.decode(), value, 1) != [1.0]:
-            notes.append(f"{os.path.basename(path)}: {key.decode()} {shown(value.decode('latin-1'))} is not applied")
-        elif key == b"PRIMARIES":
+        key, _, value = line.partition("=")  # an indented line is the header of an image that this was derived from
+        if key == "FORMAT" and value.strip() != "32-bit_rle_rgbe":
+            raise InputError(path, f"FORMAT: expected 32-bit_rle_rgbe, got {shown(value)}; convert it with ra_xyze -r")
+        if key in ("EXPOSURE", "COLORCORR"):
+            factor = factor * _positive(path, key, value)
+        elif key in ("PIXASPECT", "GAMMA") and _positive(path, key, value) != [1.0]:
+            notes.append(f"{os.path.basename(path)}: {key} {shown(value)} is not applied")
+        elif key == "PRIMARIES":
             try:
                 numbers = [float(word) for word in value.split()]
                 matrix = None if numbers == [0.0] * 8 else rec709_from_primaries(numbers)  # Photoshop writes zeros
             except ValueError:
-                got = shown(value.decode("latin-1"))
-                raise InputError(path, f"PRIMARIES: expected those of a color space, got {got}; resave it") from None
+                expected = "expected those of a color space"
+                raise InputError(path, f"PRIMARIES: {expected}, got {shown(value)}; resave it") from None
             if matrix is not None:
                 notes.append(f"{os.path.basename(path)}: colors converted to Rec. 709 from PRIMARIES")
 
 
-def _positive(path, field: str, value: bytes, count: int) -> list[float]:
-    try:
+def _positive(path, field: str, value: str) -> list[float]:
+    count, amount = (3, "3 positive numbers") if field == "COLORCORR" else (1, "a positive number")
+    with contextlib.suppress(ValueError):
         numbers = [float(word) for word in value.split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count or not all(1e-12 < number < 1e12 for number in numbers):
-        amount = "a positive number" if count == 1 else f"{count} positive numbers"
-        raise InputError(path, f"{field}: expected {amount}, got {shown(value.decode('latin-1'))}; correct the header")
-    return numbers
+        if len(numbers) == count and all(1e-12 < number < 1e12 for number in numbers):
+            return numbers
+    raise InputError(path, f"{field}: expected {amount}, got {shown(value)}; correct the header")
 
 
 def _scanlines(path, data: bytes, at: int, count: int, length: int) -> np.ndarray:

@@ -50,10 +50,10 @@ def usdz_bytes(asset: Asset) -> bytes:
         reader = _shader(stage, "st", "UsdPrimvarReader_float2")
         reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
         surface = _shader(stage, "surface", "UsdPreviewSurface")
-        wrap_s, wrap_t = addressing(asset)
-        base = _texture(stage, reader, "base_color", "sRGB", wrap_s, wrap_t)
-        packed = _texture(stage, reader, "metallic_roughness", "raw", wrap_s, wrap_t)
-        normal = _texture(stage, reader, "normal", "raw", wrap_s, wrap_t)
+        wrap = addressing(asset)
+        base = _texture(stage, reader, "base_color", "sRGB", wrap)
+        packed = _texture(stage, reader, "metallic_roughness", "raw", wrap)
+        normal = _texture(stage, reader, "normal", "raw", wrap)
         normal.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
         normal.CreateInput("bias", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
         for slot, kind, source, channel in (
@@ -80,20 +80,16 @@ def _shader(stage, name: str, kind: str):
     return shader
 
 
-def _texture(stage, reader, name: str, space: str, wrap_s: str, wrap_t: str):
+def _texture(stage, reader, name: str, space: str, wrap: tuple[str, str]):
     """Shader that reads ``NAME.png`` with the texture coordinates of ``reader``."""
     from pxr import Sdf
 
     shader = _shader(stage, name, "UsdUVTexture")
     shader.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(f"./{name}.png"))
     shader.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set(space)
-    for side, mode in (("wrapS", wrap_s), ("wrapT", wrap_t)):
+    for side, mode in zip(("wrapS", "wrapT"), wrap):
         shader.CreateInput(side, Sdf.ValueTypeNames.Token).Set(mode)
     shader.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
-    for channel, kind in (
-        ("rgb", Sdf.ValueTypeNames.Float3),
-        ("g", Sdf.ValueTypeNames.Float),
-        ("b", Sdf.ValueTypeNames.Float),
-    ):
-        shader.CreateOutput(channel, kind)
+    for channel in ("rgb", "g", "b"):
+        shader.CreateOutput(channel, Sdf.ValueTypeNames.Float3 if channel == "rgb" else Sdf.ValueTypeNames.Float)
     return shader

@@ -33,11 +33,8 @@ def check_folder(folder: Path) -> Path:
     folder = Path(os.path.realpath(folder))
     for part in folder.parts:
         if (size := len(os.fsencode(part))) > LONGEST:
-            raise InputError(
-                shown(part),
-                f"expected a name of at most {LONGEST} bytes for the output, got {size}; rename the folder or give "
-                "another --output",
-            )
+            expected = f"expected a name of at most {LONGEST} bytes for the output"
+            raise InputError(shown(part), f"{expected}, got {size}; rename it or give another --output")
     above = folder
     while not os.path.lexists(above):
         above = above.parent
@@ -159,10 +156,8 @@ def _locked(work: Path, folder: Path) -> int:
                 return lock
         except BlockingIOError:
             os.close(lock)
-            raise OSError(
-                f"{folder}: expected no other process at this result, got one at work; wait for it or give "
-                "another --output"
-            ) from None
+            problem = "expected no other process at this result, got one at work"
+            raise OSError(f"{folder}: {problem}; wait for it or give another --output") from None
         except FileNotFoundError:
             pass
         except OSError as error:

@@ -41,15 +41,13 @@ AZIMUTHS = 24  # number of candidates
 def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callable[[], np.ndarray]:
     """Starts rendering the contact sheet in the pool; calling the result returns the sheet, ``(H, W, 3)`` uint8.
 
-    The sheet shows up to four input views; four novel views under the estimated lighting, then under the studio of
-    :mod:`reli3d.render.lights`; the maps of the first novel view; and the environment, row 0 up, +X at the center as in
-    files, scaled to mean ``ENVIRONMENT_MEAN``.
+    It shows up to four input views; four novel views under the estimated lighting, then under the studio of
+    :mod:`reli3d.render.lights`; the maps of the first; and the environment as in files, scaled to ``ENVIRONMENT_MEAN``.
 
-    views: in the frame of ``asset``.  scene: rays against the asset's mesh; None: built here.  Errors are raised by the
-    call, or immediately on CUDA or if the bridge is serial.
+    views: in the frame of ``asset``.  scene: rays against the asset's mesh; None: built here.
     """
     mesh = asset.mesh
-    rays = scene if scene is not None else RayScene(mesh.vertices, mesh.faces)
+    rays = scene or RayScene(mesh.vertices, mesh.faces)
     lights = (asset.environment, Environment(studio().radiance.to(mesh.vertices.device)))
 
     def tiles(camera: Camera, with_maps: bool) -> list[Image.Image]:

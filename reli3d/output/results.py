@@ -48,18 +48,12 @@ def complete(folder: Path, source: Path, *, refined: bool = False) -> bool:
 
 
 def measure(mesh: Mesh, scene: RayScene, views: Views) -> Callable[[], dict]:
-    """Starts the measurements of a result in the pool, as plain values.
-
-    ``mesh``: the report of the mesh welded across UV seams.  ``mask_iou``: see :func:`mask_iou`.
-    """
+    """Starts the measurements of a result in the pool; ``mesh``: the report of the mesh welded across UV seams."""
     return submit(lambda: {"mesh": asdict(report(mesh)), "mask_iou": mask_iou(scene, views)}, mesh.vertices.device)
 
 
 def mask_iou(scene: RayScene, views: Views) -> float:
-    """Mean intersection over union of a mesh's silhouettes and the masks of ``views`` in the same frame, to 1e-4.
-
-    scene: rays against the mesh.
-    """
+    """Mean IoU of the silhouettes of the mesh of ``scene`` and the masks of ``views`` in the same frame, to 1e-4."""
     batch = views.resampled(SILHOUETTE_PIXELS, crop=True)
     origins, directions = camera_rays(batch.camera)
     far = torch.full((directions[..., 0].numel(),), torch.inf, device=directions.device, dtype=torch.float32)
@@ -90,14 +84,11 @@ def encode(
     translation: Sequence[float] = (0.0, 0.0, 0.0),
     scene: RayScene | None = None,
 ) -> tuple[Callable[[], bytes], Callable[[], str]]:
-    """Starts encoding ``mesh.glb`` and ``viewer.html`` in the pool; the encoders release the interpreter lock.
+    """Starts encoding ``mesh.glb`` and ``viewer.html`` in the pool; the results block until the content is ready.
 
-    The results block until the content is ready.  The page is in the frame of the mesh.
-
-    views: the input views, in the frame of ``asset``.  record: content of ``run_info.json``; its frames and weights are
-    also stored in ``mesh.glb``.  name: title of the page.  before: the asset before refinement, also shown on the page.
-    translation: translation of the mesh in ``mesh.glb``, see :func:`~reli3d.io.glb.write_glb`; not applied on the page.
-    scene: rays against the mesh of ``asset``.
+    views: in the frame of ``asset``, as the page.  record: content of ``run_info.json``; frames and weights are also
+    stored in ``mesh.glb``.  name: title of the page.  before: the asset before refinement, also shown on the page.
+    translation: of the mesh in ``mesh.glb`` alone.  scene: rays against the mesh of ``asset``.
     """
     device = asset.mesh.vertices.device
     kept = submit(partial(shadow, asset.mesh, scene), device)  # the longest first
@@ -132,17 +123,15 @@ def write_results(
 ) -> None:
     """Writes :data:`FILES`; on an error the folder is unchanged.  Raises OSError, ValueError.
 
-    replacing: from :func:`.folder.claimed`.  glb, page: from :func:`encode`.  sheet: contact sheet of the asset, from
-    :func:`~reli3d.output.preview.preview`.  info: content of ``run_info.json``, to which the environment convention is
-    added.  comparison: contact sheet of a refinement.
+    replacing: from :func:`.folder.claimed`.  glb, page: from :func:`encode`.  sheet, comparison: contact sheets of the
+    asset and of a refinement.  info: content of ``run_info.json``, to which the environment convention is added.
     """
-    light = asset.light
     info = {**info, "environment_centre": "+X"}  # a key that other programs read
     with replacing() as new:
         (new / "preview.png").write_bytes(png_bytes(sheet))
         (new / "mesh.glb").write_bytes(glb())
         for name in ("environment.exr", "environment.hdr"):
-            write_environment(new / name, light)
+            write_environment(new / name, asset.light)
         if comparison is not None:
             write_png(new / COMPARISON, comparison)
         (new / "viewer.html").write_text(page(), encoding="utf-8")
@@ -157,7 +146,7 @@ def frame_record(
     origin: origin of the views' frame in the folder's frame; the matrices map from the folder's frame.
     """
     shift = torch.tensor(origin, dtype=torch.float64, device="cpu")
-    read = Similarity(1.0, torch.eye(3, dtype=torch.float64, device="cpu"), -shift)
+    read = Similarity.without_rotation(-shift)
     back = output_from_views.rotation @ shift
     output = Similarity(output_from_views.scale, output_from_views.rotation, output_from_views.translation + back)
     return {

@@ -44,13 +44,16 @@ def viewer_page(
 ) -> str:
     """HTML page of ``meshes``, by name, under ``light (H, 2H, 3)`` and two built-in environments.
 
-    middle ``(3,)``, radius: center and radius of the object, for the camera.  stops: from :func:`photograph_stops`.
+    middle ``(3,)``, radius: of the object, for the camera.  stops: from :func:`photograph_stops`.
     """
     lights = {"estimated light": light, **{k: make().radiance for k, make in LIGHTS.items()}}
     data = {
         "name": name,
         "meshes": [{"name": k, "glb": _base64(v.glb), **v.shadow} for k, v in meshes.items()],
-        "lights": [_light(k, v) for k, v in lights.items()],
+        "lights": [
+            {"name": k, "hdr": _base64(environment_bytes(v)), "harmonics": light_harmonics(Environment(v)).T.tolist()}
+            for k, v in lights.items()
+        ],
         "views": list(stops),
         "middle": middle.tolist(),
         "radius": radius,
@@ -67,19 +70,14 @@ def viewer_page(
 
 
 def photograph_stops(views: Views) -> list[dict]:
-    """Camera stops at the input views, in the frame of the meshes.
-
-    Images are downsampled to ``MAX_IMAGE_PIXELS``, with the masks as alpha; intrinsics are those of the scaled image.
-    """
+    """Camera stops at the input views; images are downsampled to ``MAX_IMAGE_PIXELS``, with the masks as alpha."""
     stops = []
     for i in range(len(views)):
         height, width = views.masks[i].shape
         rgba = np.concatenate([views.images[i].cpu().numpy(), views.masks[i].cpu().numpy()[..., None]], -1)
-        bitmap = Image.fromarray((rgba * 255 + 0.5).astype(np.uint8))
         scale = min(1.0, MAX_IMAGE_PIXELS / max(width, height))
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        if size != bitmap.size:
-            bitmap = bitmap.resize(size, Image.Resampling.BOX)
+        bitmap = Image.fromarray((rgba * 255 + 0.5).astype(np.uint8)).resize(size, Image.Resampling.BOX)
         data = io.BytesIO()
         # an unregistered name would make Pillow import all formats
         bitmap.save(data, WebPImagePlugin.WebPImageFile.format, quality=QUALITY, method=METHOD)
@@ -103,17 +101,8 @@ def _base64(data: bytes) -> str:
 
 
 def shadow(mesh: Mesh, scene: RayScene | None = None) -> dict[str, str | float]:
-    """Self-shadowing of every vertex of ``mesh`` as spherical harmonics.
-
-    Deflated, 16 bytes per vertex, in steps of ``largest`` / 127.  scene: rays against the mesh; None: built here.
-    """
+    """Self-shadowing of the vertices as spherical harmonics, deflated, 16 bytes each, in steps of ``largest`` / 127."""
     blocked = blocked_transfer(mesh, scene=scene).cpu()
     largest = float(blocked.abs().amax()) if blocked.numel() else 0.0
     steps = (blocked * (127.0 / max(largest, MIN_TRANSFER))).round().to(torch.int8)
     return {"blocked": _base64(zlib.compress(steps.numpy().tobytes(), DEFLATE_LEVEL)), "largest": largest}
-
-
-def _light(name: str, radiance: Tensor) -> dict:
-    """An environment map and its spherical harmonics for each channel."""
-    harmonics = light_harmonics(Environment(radiance)).T.tolist()
-    return {"name": name, "hdr": _base64(environment_bytes(radiance)), "harmonics": harmonics}

@@ -26,7 +26,8 @@ def read_llff(folder: Path, path: Path) -> tuple[list[Frame], list[str]]:
     """
     table = _load(path)
     if isinstance(table, dict) or table.ndim != 2 or table.shape[1] != 17:
-        raise InputError(path, f"expected an array of shape (V, 17), got {_shape(table)}; run LLFF's imgs2poses again")
+        got = f"{len(table)} named arrays" if isinstance(table, dict) else str(table.shape)
+        raise InputError(path, f"expected an array of shape (V, 17), got {got}; run LLFF's imgs2poses again")
     place = next((at for at in LLFF_IMAGES if images_in(folder / at)), LLFF_IMAGES[0])
     images = _as_many(path, folder / place, len(table))
     frames = []
@@ -34,11 +35,8 @@ def read_llff(folder: Path, path: Path) -> tuple[list[Frame], list[str]]:
         where, pose = f"{path}: row {k}", row[:15].reshape(3, 5)
         height, width, focal = pose[:, 4]
         if not (height >= 1 and width >= 1 and focal > 0):
-            raise InputError(
-                where,
-                f"hwf: expected a positive size and focal length, got {shown(pose[:, 4].tolist())}; "
-                "run LLFF's imgs2poses again",
-            )
+            got = shown(pose[:, 4].tolist())
+            raise InputError(where, f"hwf: expected a positive size and focal length, got {got}; run imgs2poses again")
         c2w = np.eye(4)
         c2w[:3] = np.stack([pose[:, 1], -pose[:, 0], pose[:, 2], pose[:, 3]], -1)
         lens = Lens(focal=(focal, focal), size=(round(width), round(height)))
@@ -60,9 +58,8 @@ def read_neus(folder: Path, path: Path) -> tuple[list[Frame], list[str]]:
     images = _as_many(path, folder / place, sum(key.startswith("world_mat_") and "inv" not in key for key in arrays))
     masks = [at for at in (images_in(folder / at) for at in named(folder, ("mask", "masks"))) if at]
     if masks and len(masks[0]) != len(images):
-        raise InputError(
-            masks[0][0].parent, f"expected {len(images)} masks, one for each image, got {len(masks[0])}; add or remove"
-        )
+        expected = f"expected {len(images)} masks, one for each image"
+        raise InputError(masks[0][0].parent, f"{expected}, got {len(masks[0])}; add or remove")
     frames = []
     for k, image in enumerate(images):
         where = f"{path}: world_mat_{k}, scale_mat_{k}"
@@ -70,18 +67,14 @@ def read_neus(folder: Path, path: Path) -> tuple[list[Frame], list[str]]:
         if [m.shape for m in pair] != [(4, 4), (4, 4)]:
             raise InputError(where, "expected a 4x4 array each, got none or another shape; export the cameras again")
         world, scale = (_finite(path, m) for m in pair)
-        focal, (cx, cy), c2w = decompose_projection(where, (world @ scale)[:3])
-        center = cx + 0.5, cy + 0.5  # pixel centers at whole numbers there
-        name = image.relative_to(folder).as_posix()
-        c2w = nearest_rigid(where, "rotation", c2w)
-        frames.append(Frame(where, name, image, masks[0][k] if masks else None, c2w, Lens(focal=focal, center=center)))
+        lens, c2w = _decomposed(where, (world @ scale)[:3])
+        name, mask = image.relative_to(folder).as_posix(), masks[0][k] if masks else None
+        frames.append(Frame(where, name, image, mask, nearest_rigid(where, "rotation", c2w), lens))
     return frames, []
 
 
-def decompose_projection(
-    where: str, projection: np.ndarray
-) -> tuple[tuple[float, float], tuple[float, float], np.ndarray]:
-    """Focal lengths and principal point [px], and camera-to-world ``(4, 4)`` in OpenGL axes, of a ``(3, 4)`` matrix.
+def _decomposed(where: str, projection: np.ndarray) -> tuple[Lens, np.ndarray]:
+    """Lens, and camera-to-world ``(4, 4)`` in OpenGL axes, of a ``(3, 4)`` matrix.
 
     ``projection`` is K [R | t] times any factor but 0, in OpenCV axes.  RQ decomposition of its left 3x3 block (Hartley
     and Zisserman 2004, section 6.2.4).  Raises InputError for a singular block or a skew.
@@ -99,7 +92,8 @@ def decompose_projection(
     c2w = np.eye(4)
     c2w[:3, :3] = rotation.T * (1, -1, -1)  # columns y and z turned: OpenCV to OpenGL axes
     c2w[:3, 3] = -np.linalg.solve(block, projection[:, 3])
-    return ((float(upper[0, 0]), float(upper[1, 1])), (float(upper[0, 2]), float(upper[1, 2])), c2w)
+    (fx, _, cx), (_, fy, cy), _ = upper.tolist()
+    return Lens(focal=(fx, fy), center=(cx + 0.5, cy + 0.5)), c2w  # pixel centers at whole numbers there
 
 
 def _load(path: Path) -> np.ndarray | dict[str, np.ndarray]:
@@ -124,16 +118,9 @@ def _finite(path: Path, array: np.ndarray) -> np.ndarray:
     return array.astype(np.float64)
 
 
-def _shape(array: np.ndarray | dict) -> str:
-    return f"{len(array)} named arrays" if isinstance(array, dict) else str(array.shape)
-
-
 def _as_many(path: Path, folder: Path, count: int) -> list[Path]:
     images = images_in(folder)
     if len(images) != count or not images:
-        raise InputError(
-            path,
-            f"expected {count} images in {folder.name}, one for each camera in the order of their names, got "
-            f"{len(images)}; add or remove images",
-        )
+        expected = f"expected {count} images in {folder.name}, one for each camera in the order of their names"
+        raise InputError(path, f"{expected}, got {len(images)}; add or remove images")
     return images

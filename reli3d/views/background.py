@@ -15,10 +15,7 @@ NETWORK = "isnet-general-use"  # Qin and others 2022, Highly accurate dichotomou
 
 
 class Remover:
-    """Segments images, one at a time; the network is loaded with the first image.
-
-    Raises InputError for ``option`` if the network cannot be loaded.
-    """
+    """Segments images, one at a time; loads the network with the first, else raises InputError for ``option``."""
 
     def __init__(self, option: str = "remove-background"):
         self.option, self.network, self.masks = option, NETWORK, 0
@@ -42,7 +39,6 @@ def _loaded(network: str, option: str) -> Callable[[Image.Image], Image.Image]:
     try:
         session = rembg.new_session(network)
     except (OSError, ValueError) as error:  # no network, a full disk; another file than the published one
-        raise InputError(
-            option, f"expected the network {network} of rembg, got {error}; it is fetched once, or give masks"
-        ) from None
+        expected = f"expected the network {network} of rembg"
+        raise InputError(option, f"{expected}, got {error}; it is fetched once, or give masks") from None
     return lambda bitmap: rembg.remove(bitmap.convert("RGB"), session=session, only_mask=True).convert("L")

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFilter, ImageOps
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
@@ -18,7 +18,7 @@ from reli3d._bridge import full_precision
 from reli3d.errors import printable
 from reli3d.geometry.camera import project
 from reli3d.io.images import write_png
-from reli3d.views.normalize import EYE_RESOLUTION, RADIUS, Hull, center_rays, meeting_point, normalize, visual_hull
+from reli3d.views.normalize import EYE_RESOLUTION, RADIUS, Hull, center_rays, normalize, visual_hull
 from reli3d.views.views import Views
 
 MIN_FILLED = 0.8  # fraction of every mask that the hull of right cameras fills; masks a few pixels off still reach 0.9
@@ -35,11 +35,10 @@ def explain_cameras(views: Views) -> list[str]:
     hull, filled = agreement(views)
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
     rays = center_rays([m.cpu() for m in views.masks], c2w, intrinsics)
-    target = hull.points.mean(0) if len(hull.points) else meeting_point(c2w[:, :3, 3], rays)[0]
     lines = []
     for i, name in enumerate(views.names):
         height, width = views.masks[i].shape
-        away = target - c2w[i, :3, 3]
+        away = hull.middle() - c2w[i, :3, 3]
         angle = math.degrees(math.acos(max(-1.0, min(1.0, float(away @ rays[i] / away.norm().clamp_min(1e-12))))))
         fov = [math.degrees(2 * math.atan(0.5 * s / float(f))) for s, f in zip((width, height), intrinsics[i, :2])]
         side = "behind the camera" if angle > 90 else f"{angle:.1f} deg off the object's middle"
@@ -115,30 +114,20 @@ def _alternatives(views: Views):
     inverse = torch.linalg.inv(given).to(c2w)
     turned = c2w.clone()
     turned[:, :3, :3] = c2w[:, :3, :3].transpose(1, 2)
-    cases = [
-        (
-            "the camera axes look flipped: OpenCV (+Y down, looking along +Z) given, OpenGL expected",
-            "negate the second and third column of each matrix",
-            c2w * flip,
-        ),
+    flipped = "OpenCV (+Y down, looking along +Z) given, OpenGL expected"
+    negate, transpose = "negate the second and third column of each matrix", "transpose the 3x3 blocks"
+    quarter = "the images look turned by 90 degrees (an EXIF orientation that was applied or lost?)"
+    exchanged = c2w[..., [1, 0, 2, 3]]
+    cases = (
+        (f"the camera axes look flipped: {flipped}", negate, c2w * flip),
         ("the matrices look like world-to-camera", "store their inverses", inverse),
-        (
-            "the matrices look like world-to-camera in OpenCV axes (as COLMAP has them)",
-            "store their inverses with the second and third column negated",
-            inverse * flip,
-        ),
-        ("the rotations look transposed (world-to-camera) with camera positions", "transpose the 3x3 blocks", turned),
-        (
-            "the rotations look transposed and in OpenCV axes with camera positions",
-            "transpose the 3x3 blocks, then negate their second and third column",
-            turned * flip,
-        ),
+        ("the matrices look like world-to-camera in OpenCV axes", f"invert, then {negate}", inverse * flip),
+        ("the rotations look transposed (world-to-camera) with camera positions", transpose, turned),
+        ("the rotations look transposed and in OpenCV axes", f"{transpose}, then {negate}", turned * flip),
         ("the images look upside down", "turn them by 180 degrees", c2w * c2w.new_tensor([-1.0, -1.0, 1.0, 1.0])),
-    ]
-    for sign in (1.0, -1.0):
-        what = "the images look turned by 90 degrees (an EXIF orientation that was applied or lost?)"
-        quarter = c2w[..., [1, 0, 2, 3]] * c2w.new_tensor([-sign, sign, 1.0, 1.0])
-        cases.append((what, "store them as they were calibrated", quarter))
+        (quarter, "store them as they were calibrated", exchanged * c2w.new_tensor([-1.0, 1.0, 1.0, 1.0])),
+        (quarter, "store them as they were calibrated", exchanged * c2w.new_tensor([1.0, -1.0, 1.0, 1.0])),
+    )
     for what, fix, poses in cases:
         yield what, fix, replace(views, c2w=poses)
 
@@ -207,14 +196,13 @@ def draw_rig(views: Views, path: str | os.PathLike) -> None:
     """
     hull, filled = agreement(views)
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
-    target = hull.points.mean(0) if len(hull.points) else hull.aim
-    eyes = c2w[:, :3, 3]
+    target, eyes = hull.middle(), c2w[:, :3, 3]
     reach = max(float((eyes - target).norm(dim=-1).max()), float(eyes.norm(dim=-1).max())) or 1.0
     frustums = [_frustum(c, k, tuple(m.shape), 0.16 * reach) for c, k, m in zip(c2w, intrinsics, views.masks)]
     cube = _cube(views) if len(hull.points) else target[None].numpy()
     spread = np.concatenate([*frustums, cube, np.zeros((1, 3))])
     middle, reach = (spread.min(0) + spread.max(0)) / 2, 0.55 * float((spread.max(0) - spread.min(0)).max())
-    columns = max(1, (2 * PANEL + MARGIN) // (THUMB + MARGIN))
+    columns = (2 * PANEL + MARGIN) // (THUMB + MARGIN)
     rows = -(-len(views) // columns)
     size = (2 * PANEL + 3 * MARGIN, PANEL + 2 * MARGIN + rows * (THUMB + 18 + MARGIN))
     canvas = Image.new("RGB", size, "white")
@@ -236,9 +224,7 @@ def latin(text: str) -> str:
 
 def _frustum(pose: Tensor, camera: Tensor, shape: tuple[int, ...], length: float) -> np.ndarray:
     """``(5, 3)`` world points: the eye and the four image corners at depth ``length``."""
-    corners = torch.tensor(
-        [[0, 0], [shape[1], 0], [shape[1], shape[0]], [0, shape[0]]], dtype=torch.float64, device="cpu"
-    )
+    corners = camera.new_tensor([[0, 0], [1, 0], [1, 1], [0, 1]]) * camera.new_tensor([shape[1], shape[0]])
     x, y = ((corners - camera[2:]) / camera[:2]).unbind(-1)
     local = length * torch.stack([x, -y, -torch.ones_like(x)], -1)
     return torch.cat([pose[:3, 3][None], local @ pose[:3, :3].T + pose[:3, 3]]).numpy()
@@ -254,12 +240,10 @@ def _panel(views, hull, middle, reach, frustums, title, vertical) -> Image.Image
     """The rig with x to the right.  vertical: world axis along the image's rows, and its sign downwards."""
     down, sign = vertical
     bitmap = Image.new("RGB", (PANEL, PANEL), "#f4f4f4")
-    draw = ImageDraw.Draw(bitmap)
-    zoom = 0.5 * PANEL / reach
+    draw, zoom = ImageDraw.Draw(bitmap), 0.5 * PANEL / reach
 
-    def at(points) -> list[tuple[float, float]]:
-        p = (np.asarray(points, dtype=np.float64).reshape(-1, 3) - middle) * zoom
-        return [(PANEL / 2 + a, PANEL / 2 + sign * b) for a, b in zip(p[:, 0], p[:, down])]
+    def at(points: np.ndarray) -> list[list[float]]:
+        return (PANEL / 2 + (points.reshape(-1, 3) - middle)[:, [0, down]] * zoom * (1, sign)).tolist()
 
     if len(hull.points):
         points = hull.points.numpy()
@@ -268,19 +252,17 @@ def _panel(views, hull, middle, reach, frustums, title, vertical) -> Image.Image
         half = max(1.0, 0.5 * hull.cell * zoom)
         for (x, y), gray in zip(at(points[order]), shade):
             draw.rectangle((x - half, y - half, x + half, y + half), fill=(int(gray),) * 2 + (int(gray) + 30,))
-        flat = at(_cube(views))
-        xs, ys = [p[0] for p in flat], [p[1] for p in flat]
+        xs, ys = zip(*at(_cube(views)))
         draw.rectangle((min(xs), min(ys), max(xs), max(ys)), outline="#606060")
-    origin = at(np.zeros((1, 3)))[0]
-    draw.line((origin[0] - 5, origin[1], origin[0] + 5, origin[1]), fill="black")
-    draw.line((origin[0], origin[1] - 5, origin[0], origin[1] + 5), fill="black")
+    ((x, y),) = at(np.zeros((1, 3)))
+    draw.line((x - 5, y, x + 5, y), fill="black")
+    draw.line((x, y - 5, x, y + 5), fill="black")
     for i, frustum in enumerate(frustums):
-        color_of = _COLORS[i % len(_COLORS)]
-        eye, *corners = at(frustum)
-        for k in range(4):
-            draw.line((*eye, *corners[k]), fill=color_of, width=2)
-            draw.line((*corners[k], *corners[(k + 1) % 4]), fill=color_of, width=4 if k == 0 else 2)  # bold: the top
-        draw.line((*eye, *at(hull.points.mean(0).numpy() if len(hull.points) else hull.aim.numpy())[0]), fill="#c8c8c8")
+        color_of, (eye, *corners) = _COLORS[i % len(_COLORS)], at(frustum)
+        for k, corner in enumerate(corners):
+            draw.line((*eye, *corner), fill=color_of, width=2)
+            draw.line((*corners[k - 1], *corner), fill=color_of, width=4 if k == 1 else 2)  # bold: the top
+        draw.line((*eye, *at(hull.middle().numpy())[0]), fill="#c8c8c8")
         draw.text((eye[0] + 4, eye[1] + 4), str(i), fill=color_of)
     draw.text((6, 4), f"{title}; square: the network's cube, cross: origin", fill="black")
     scale = 10 ** math.floor(math.log10(reach))
@@ -293,17 +275,16 @@ def _thumbnail(views: Views, hull: Hull, i: int) -> Image.Image:
     height, width = views.masks[i].shape
     zoom = THUMB / max(height, width)
     size = (max(1, round(width * zoom)), max(1, round(height * zoom)))
-    image = Image.fromarray((views.images[i].cpu().numpy() * 255).astype(np.uint8)).resize(size, Image.Resampling.BOX)
-    mask = Image.fromarray((views.masks[i].cpu().numpy() * 255).astype(np.uint8)).resize(size, Image.Resampling.BOX)
-    pixels, inside = np.array(image), np.asarray(mask) > 127
-    grown = np.pad(inside, 1)
-    near = grown[:-2, 1:-1] | grown[2:, 1:-1] | grown[1:-1, :-2] | grown[1:-1, 2:]
+    image, mask = (
+        Image.fromarray((values[i].cpu().numpy() * 255).astype(np.uint8)).resize(size, Image.Resampling.BOX)
+        for values in (views.images, views.masks)
+    )
+    pixels = np.array(image)
+    inside, near = (np.asarray(m) > 127 for m in (mask, mask.filter(ImageFilter.MaxFilter(3))))
     if len(hull.points):
         at, _ = project(hull.points[::7].float(), views.c2w[i].cpu(), views.intrinsics[i].cpu())
         x, y = (at * zoom).floor().long().unbind(-1)
         keep = (x >= 0) & (y >= 0) & (x < size[0]) & (y < size[1])
         pixels[y[keep].numpy(), x[keep].numpy()] = (220, 30, 30)
     pixels[near & ~inside] = (0, 200, 0)
-    thumbnail = Image.new("RGB", (THUMB, THUMB), "white")
-    thumbnail.paste(Image.fromarray(pixels), ((THUMB - size[0]) // 2, (THUMB - size[1]) // 2))
-    return thumbnail
+    return ImageOps.pad(Image.fromarray(pixels), (THUMB, THUMB), color="white")

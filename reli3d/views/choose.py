@@ -23,21 +23,16 @@ def view_distances(c2w: Tensor) -> tuple[Tensor, Tensor]:
     """
     poses = c2w.double().cpu()
     eyes, axes = poses[:, :3, 3], -poses[:, :3, 2]
-    away = eyes - _looked_at(eyes, axes)
+    one = torch.eye(3, dtype=axes.dtype, device=axes.device)
+    beside = one - axes[:, :, None] * axes[:, None]
+    right = (beside @ eyes[..., None]).mean(0)[:, 0] + 1e-5 * meeting_point(eyes, axes)[0]
+    away = eyes - torch.linalg.solve(beside.mean(0) + 1e-5 * one, right)  # a prior of 1e-5 of an axis at meeting_point
     length = away.norm(dim=-1).clamp_min(1e-12)
     to = away / length[:, None]
     across = torch.linalg.cross(to[:, None].expand(-1, len(to), -1), to[None].expand(len(to), -1, -1)).norm(dim=-1)
     angle = torch.atan2(across, to @ to.T)  # exact for small angles, where the arc cosine is not
     closer = LOG_DISTANCE_WEIGHT_RAD * (length.log()[:, None] - length.log())
     return angle, (angle.square() + closer.square()).sqrt()
-
-
-def _looked_at(eyes: Tensor, axes: Tensor) -> Tensor:
-    """The point nearest to all optical axes, with a prior of 1e-5 of an axis at :func:`meeting_point`."""
-    one = torch.eye(3, dtype=axes.dtype, device=axes.device)
-    across = one - axes[:, :, None] * axes[:, None]
-    right = (across @ eyes[..., None]).mean(0)[:, 0]
-    return torch.linalg.solve(across.mean(0) + 1e-5 * one, right + 1e-5 * meeting_point(eyes, axes)[0])
 
 
 @full_precision
@@ -64,15 +59,12 @@ def choose_views(c2w: Tensor, count: int, *, min_distance: float = 0.0) -> list[
 def spread_notes(c2w: Tensor) -> list[str]:
     """Notes on near-duplicate views and on a narrow baseline, at most one line each."""
     angle, distance = view_distances(c2w)
-    notes = []
-    # near an earlier view
-    again = (distance + torch.full_like(distance, torch.inf).triu()).amin(1) < DUPLICATE_DISTANCE_RAD
-    if bool(again.any()):
-        which = ", ".join(str(i) for i in again.nonzero()[:, 0].tolist()[:8]) + (", ..." if again.sum() > 8 else "")
-        notes.append(
-            f"{int(again.sum())} of {len(c2w)} views lie within {math.degrees(DUPLICATE_DISTANCE_RAD):.0f} degrees of "
-            f"an earlier one and add little information: {which}"
-        )
+    notes, limit = [], DUPLICATE_DISTANCE_RAD
+    again = [i for i, row in enumerate(distance.tolist()) if min(row[:i], default=math.inf) < limit]
+    if again:
+        which = ", ".join(map(str, again[:8])) + (", ..." if len(again) > 8 else "")
+        text = f"{len(again)} of {len(c2w)} views lie within {math.degrees(limit):.0f} degrees of an earlier one"
+        notes.append(f"{text} and add little information: {which}")
     widest = float(angle.max())
     if len(c2w) > 1 and widest < NARROW_BASELINE_RAD:
         text = f"narrow baseline: all views lie within {math.degrees(widest):.1f} degrees"

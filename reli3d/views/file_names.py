@@ -2,6 +2,7 @@
 
 import os
 import unicodedata
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
@@ -14,7 +15,7 @@ class FolderIndex:
     """Cached folder listings: finds files by exact name, else regardless of case and Unicode form."""
 
     def __init__(self) -> None:
-        self._names: dict[str, dict[str, list[str]]] = {}
+        self._names: dict[Path, dict[str, list[str]]] = {}
 
     def find(self, folder: str | os.PathLike, relative: PurePath) -> Path | None:
         """The path below ``folder``, in which no part is ``..``; None if there is none.
@@ -23,13 +24,12 @@ class FolderIndex:
         """
         at = Path(folder)
         for part in relative.parts:
-            key = str(at)
-            if key not in self._names:
-                found: dict[str, list[str]] = {}
+            if at not in self._names:
+                found: dict[str, list[str]] = defaultdict(list)
                 for name in _listed(at):
-                    found.setdefault(_key(name), []).append(name)
-                self._names[key] = found
-            names = self._names[key].get(_key(part), [])
+                    found[_key(name)].append(name)
+                self._names[at] = found  # complete: other threads read it
+            names = self._names[at].get(_key(part), [])
             if part in names:
                 at = at / part
             elif len(names) == 1:

@@ -5,7 +5,7 @@ Supported: ``transforms.json`` (object folders as published, Blender, nerfstudio
 object is separated from the background by the images' alpha, by ``mask_path``, or by files in a folder ``masks``.
 """
 
-import contextlib
+import itertools
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -25,7 +25,7 @@ from reli3d.views.background import Remover
 from reli3d.views.choose import DUPLICATE_DISTANCE_RAD, choose_views, spread_notes
 from reli3d.views.colmap import find_colmap, read_colmap
 from reli3d.views.file_names import ENDINGS, FolderIndex
-from reli3d.views.frames import Frame, Lens, check_distortion, file_within
+from reli3d.views.frames import Frame, Lens, check_distortion, file_within, is_within
 from reli3d.views.masks import MaskFiles, alpha_values, check_one_label, mask_values
 from reli3d.views.missing_cameras import no_cameras
 from reli3d.views.normalize import near_origin
@@ -64,17 +64,17 @@ def load_views(
     """
     if views is not None and (isinstance(views, bool) or not isinstance(views, int) or not 1 <= views <= MAX_VIEWS):
         raise InputError("views", f"expected 1 to {MAX_VIEWS}, got {views!r}; give a number in that range")
-    root, is_folder = Path(folder), False
-    with contextlib.suppress(OSError, ValueError):
-        is_folder = root.is_dir()
-    if not is_folder:
+    root = Path(folder)
+    if not os.path.isdir(root):
         raise no_cameras(root)
     if masks is not None and not Path(masks).is_dir():
         raise InputError(masks, "masks: expected a folder of mask images, got none; check the path")
     frames, notes = _read_cameras(root)
     index = FolderIndex()
-    frames = [replace(f, image=_existing(root, f.image, index) or f.image) for f in frames]
-    frames = [replace(f, mask=f.mask and _existing(root, f.mask, index) or f.mask) for f in frames]
+    frames = [
+        replace(f, image=_existing(root, f.image, index), mask=f.mask and _existing(root, f.mask, index))
+        for f in frames
+    ]
     _check_poses(frames)
     files = MaskFiles(root, frames, None if masks is None else Path(masks))
     offered, names = len(frames), [frame.name for frame in frames]
@@ -208,24 +208,18 @@ def _load(
     notes: list[str] = []
     path = frame.image
     if not os.path.exists(path):
-        raise InputError(
-            frame.where,
-            f"file_path: expected an image, got {shown(frame.name)} which does not exist; "
-            "paths are relative to the camera file and use /",
-        )
+        got = f"{shown(frame.name)} which does not exist"
+        fix = "paths are relative to the camera file and use /"
+        raise InputError(frame.where, f"file_path: expected an image, got {got}; {fix}")
     _still_inside(root, path, frame, "file_path")
     bitmap = decode_image(path, notes=notes, calibrated=frame.lens.size)
     width, height = bitmap.size
     if min(height, width) < MIN_SIDE:
-        raise InputError(
-            path, f"expected at least {MIN_SIDE} pixels a side, got {width} x {height}; give a larger image"
-        )
+        raise InputError(path, f"expected at least {MIN_SIDE} pixels a side, got {width} x {height}; scale it up")
     mask = _mask(root, frame, bitmap, files, notes, remover)
     if mask.size != (width, height):
         got = f"{mask.size[0]} x {mask.size[1]}"
-        raise InputError(
-            path, f"mask: expected {width} x {height} pixels as the image, got {got}; save it at that size"
-        )
+        raise InputError(path, f"mask: expected the image's {width} x {height} pixels, got {got}; save it at that size")
     _not_empty(mask, path)
     camera = intrinsics_of(frame.lens, width, height, frame.where, notes)
     part = cut(bitmap.size, above(mask, MASK_EDGE), whole=whole)
@@ -240,11 +234,8 @@ def _load(
 
 def _not_empty(mask: Image.Image, path: Path) -> None:
     if int(above(mask, 0.5).sum()) < MIN_OBJECT:
-        raise InputError(
-            path,
-            "mask: expected the object to be opaque (white), got a mask that is empty; "
-            "check that it is neither blank nor inverted",
-        )
+        expected = "expected the object to be opaque (white), got a mask that is empty"
+        raise InputError(path, f"mask: {expected}; check that it is neither blank nor inverted")
 
 
 def looks_premultiplied(image: np.ndarray, mask: np.ndarray) -> bool:
@@ -275,18 +266,14 @@ def _mask(
     found = files.of(frame)
     if found is not None:
         if not os.path.exists(found):
-            raise InputError(
-                frame.where,
-                f"mask_path: expected an image, got {shown(os.path.relpath(found, root))}, which does not exist; "
-                "correct the path",
-            )
+            got = f"{shown(os.path.relpath(found, root))}, which does not exist"
+            raise InputError(frame.where, f"mask_path: expected an image, got {got}; correct the path")
         if files.given is None:
             _still_inside(root, found, frame, "mask")
         return mask_values(found, decode_image(found, notes=notes, calibrated=frame.lens.size), notes)
     if files.given is not None:
-        raise InputError(
-            files.given, f"masks: expected a file with the stem of {shown(frame.image.name)}, got none; add it"
-        )
+        expected = f"expected a file with the stem of {shown(frame.image.name)}"
+        raise InputError(files.given, f"masks: {expected}, got none; add it")
     if remover is not None:
         return remover.mask(bitmap)
     got = "alpha that is opaque everywhere" if bitmap.mode == "RGBA" else "no alpha"
@@ -295,31 +282,18 @@ def _mask(
     raise InputError(frame.image, f"{problem}; {fix}, or give --remove-background")
 
 
-def _existing(root: Path, path: Path, index: FolderIndex) -> Path | None:
+def _existing(root: Path, path: Path, index: FolderIndex) -> Path:
     """``path``, or that with the ending of an image (Blender's exporter leaves it out), or with other cases."""
-    try:
-        candidates = (path, *(path.with_name(path.name + ending) for ending in ENDINGS))
-        for candidate in candidates:
-            if candidate.is_file():
-                return candidate
-        below = os.path.relpath(path.parent, root)
-        for candidate in candidates:
-            found = index.find(root, PurePath(os.path.normpath(os.path.join(below, candidate.name))))
-            if found is not None and found.is_file():
-                return found
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-    return None
+    candidates = [path.with_name(path.name + ending) for ending in ("", *ENDINGS)] if path.name else [path]
+    below = os.path.relpath(path.parent, root)
+    others = (index.find(root, PurePath(os.path.normpath(os.path.join(below, c.name)))) for c in candidates)
+    return next((p for p in itertools.chain(candidates, others) if p is not None and os.path.isfile(p)), path)
 
 
 def _still_inside(root: Path, path: Path, frame: Frame, field: str) -> None:
-    if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
-        raise InputError(
-            frame.where,
-            f"{field}: expected a file within the folder, got {shown(path.name)} which "
-            "links out of it; copy the file in",
-        )
+    if not is_within(root, path):
+        got = f"{shown(path.name)} which links out of it"
+        raise InputError(frame.where, f"{field}: expected a file within the folder, got {got}; copy the file in")
 
 
 def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[str]) -> list[float]:
@@ -330,42 +304,29 @@ def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[s
     sx = sy = 1.0
     if lens.size is not None and lens.size != (width, height):
         sx, sy = width / lens.size[0], height / lens.size[1]
+        given = f"{lens.size[0]} x {lens.size[1]}"
         if abs(sx / sy - 1.0) > ASPECT:
-            raise InputError(
-                where,
-                f"w, h: expected the image's size {width} x {height}, got {lens.size[0]} x "
-                f"{lens.size[1]}; calibrate on these images",
-            )
-        notes.append(f"{where}: intrinsics scaled from {lens.size[0]} x {lens.size[1]} to {width} x {height}")
+            expected = f"expected the image's size {width} x {height}, got {given}"
+            raise InputError(where, f"w, h: {expected}; calibrate on these images")
+        notes.append(f"{where}: intrinsics scaled from {given} to {width} x {height}")
     if lens.focal is not None:
         fx, fy = lens.focal[0] * sx, lens.focal[1] * sy
     else:
         across, upright = present("lens.fov", lens.fov)
         fx = 0.5 * width / math.tan(0.5 * across)
         fy = fx if math.isnan(upright) else 0.5 * height / math.tan(0.5 * upright)
-    given = (math.nan, math.nan) if lens.center is None else lens.center
-    cx = 0.5 * width if math.isnan(given[0]) else given[0] * sx
-    cy = 0.5 * height if math.isnan(given[1]) else given[1] * sy
-    if max(map(abs, given)) <= 1:
-        raise InputError(
-            where,
-            f"cx, cy: expected pixels, got {given[0]:.6g} and {given[1]:.6g}, fractions of the image; multiply them by "
-            "its width and height",
-        )
+    x, y = lens.center or (math.nan, math.nan)
+    cx = 0.5 * width if math.isnan(x) else x * sx
+    cy = 0.5 * height if math.isnan(y) else y * sy
+    if max(abs(x), abs(y)) <= 1:
+        got = f"{x:.6g} and {y:.6g}, fractions of the image"
+        raise InputError(where, f"cx, cy: expected pixels, got {got}; multiply them by its width and height")
     for name, value, side in (("cx", cx, width), ("cy", cy, height)):
         if not -side < value < 2 * side:
-            raise InputError(
-                where,
-                f"{name}: expected a principal point near the image of {side} pixels, got "
-                f"{value:.6g}; "
-                "give pixels of the stored image",
-            )
-    note = check_distortion(where, lens, fx, (max(cx, width - cx), max(cy, height - cy)))
-    notes.extend([note] if note else [])
+            expected = f"expected a principal point near the image of {side} pixels, got {value:.6g}"
+            raise InputError(where, f"{name}: {expected}; give pixels of the stored image")
+    notes += check_distortion(where, lens, fx, (max(cx, width - cx), max(cy, height - cy)))
     if min(fx / width, fy / height) < 0.05 or max(fx / width, fy / height) > 1000:
-        raise InputError(
-            where,
-            f"focal length: expected 0.05 to 1000 image sides, got {fx:.6g} pixels for {width}; "
-            "give pixels (or radians for an angle)",
-        )
+        expected = f"expected 0.05 to 1000 image sides, got {fx:.6g} pixels for {width}"
+        raise InputError(where, f"focal length: {expected}; give pixels (or radians for an angle)")
     return [fx, fy, cx, cy]

@@ -2,6 +2,7 @@
 
 import math
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 
@@ -48,26 +49,18 @@ def number(where: str, field: str, value: object, low: float = -math.inf, high: 
     """``value`` as a finite float strictly between ``low`` and ``high``.  Raises InputError."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(where, f"{field}: expected a number, got {shown(value)}; write it without quotes")
-    try:
-        result = float(value)
-    except OverflowError:
-        result = math.inf
-    if not math.isfinite(result):
+    if not abs(value) <= sys.float_info.max:  # an integer may have any number of digits
         raise InputError(where, f"{field}: expected a finite number, got {shown(value)}; correct the camera file")
-    if not low < result < high:
+    if not low < value < high:
         hint = "give radians" if high == math.pi else "correct the camera file"
         raise InputError(where, f"{field}: expected a number between {low:g} and {high:g}, got {shown(value)}; {hint}")
-    return result
+    return float(value)
 
 
 def rigid(where: str, field: str, value: object) -> np.ndarray:
     """``(4, 4)`` float64 rotation and translation from nested lists.  Raises InputError; rounding is cleaned up."""
     if not isinstance(value, list) or len(value) != 4 or any(not isinstance(r, list) or len(r) != 4 for r in value):
-        raise InputError(
-            where,
-            f"{field}: expected a 4x4 matrix as four lists of four numbers, got {shape_of(value)}; "
-            "write the camera-to-world matrix row by row",
-        )
+        raise InputError(where, f"{field}: expected four lists of four numbers, got {shown(value)}; write it by rows")
     matrix = np.array([[number(where, field, v) for v in row] for row in value], dtype=np.float64)
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         transposed = np.abs(matrix[:, 3] - (0, 0, 0, 1)).max() <= 1e-6
@@ -82,40 +75,22 @@ def nearest_rigid(where: str, field: str, matrix: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
         determinant, gram = float(np.linalg.det(block)), block.T @ block
     if not np.isfinite(gram).all() or not determinant > 0:
-        raise InputError(
-            where,
-            f"{field}: expected a rotation (determinant 1), got determinant {determinant:.3g}; "
-            "a mirrored or flat camera cannot be used, export it again",
-        )
+        expected = "expected a rotation, not a mirrored or flat camera"
+        raise InputError(where, f"{field}: {expected}, got determinant {determinant:.3g}; export it again")
     if np.abs(gram - np.eye(3)).max() > ORTHONORMAL:
         scale = determinant ** (1 / 3)
         skew = np.abs(gram / scale**2 - np.eye(3)).max()
+        got, fix = "axes not at right angles or not of length 1", "export rotation and translation only"
         if skew <= ORTHONORMAL and abs(scale**2 - 1) > skew:
-            raise InputError(
-                where, f"{field}: expected a rotation without scale, got scale {scale:.4g}; divide the 3x3 block by it"
-            )
-        raise InputError(
-            where,
-            f"{field}: expected a rotation, got axes that are not at right angles or not of length "
-            "1; export rotation and translation only",
-        )
+            got, fix = f"scale {scale:.4g}", "divide the 3x3 block by it"
+        raise InputError(where, f"{field}: expected a rotation, got {got}; {fix}")
     if np.abs(matrix[:3, 3]).max() > MAX_POSE_DISTANCE:
-        raise InputError(
-            where,
-            f"{field}: expected a position within {MAX_POSE_DISTANCE:g} of the origin, got "
-            f"{shown(matrix[:3, 3].tolist())}; shift or scale the cameras",
-        )
+        expected = f"expected a position within {MAX_POSE_DISTANCE:g} of the origin"
+        raise InputError(where, f"{field}: {expected}, got {shown(matrix[:3, 3].tolist())}; shift or scale the cameras")
     u, _, vt = np.linalg.svd(block)
     result = matrix.copy()
     result[:3, :3] = u @ vt
     return result
-
-
-def shape_of(value: object) -> str:
-    """Short description of a value that should be a matrix, for an error message."""
-    if not isinstance(value, list):
-        return shown(value)
-    return f"{len(value)} rows of {sorted({len(r) if isinstance(r, list) else 'no list' for r in value}, key=str)[:4]}"
 
 
 def file_within(root: Path, where: str, field: str, value: object) -> Path:
@@ -124,55 +99,39 @@ def file_within(root: Path, where: str, field: str, value: object) -> Path:
     Errors are non-text values, text with NUL, URLs, absolute paths, and files outside ``root`` (through ``..`` or a
     link).  The file need not exist.
     """
-    if not isinstance(value, str) or not value.strip():
-        raise InputError(where, f"{field}: expected the path of a file, got {shown(value)}; correct the camera file")
-    if len(value) > MAX_PATH or "\0" in value:
-        raise InputError(
-            where,
-            f"{field}: expected a path of at most {MAX_PATH} characters without NUL, got "
-            f"{shown(value)}; correct the camera file",
-        )
+    expected, got = f"{field}: expected the path of a file", shown(value)
+    if not isinstance(value, str) or not value.strip() or len(value) > MAX_PATH or "\0" in value:
+        raise InputError(where, f"{expected}, 1 to {MAX_PATH} characters without NUL, got {got}; correct it")
     if "://" in value or value.lower().startswith(("file:", "data:")):
-        raise InputError(
-            where, f"{field}: expected a file of the folder, got the URL {shown(value)}; download it first"
-        )
+        raise InputError(where, f"{expected} in the folder, got the URL {got}; download it first")
     if Path(value).is_absolute() or PureWindowsPath(value).drive or value.startswith(("\\", "~")):
-        raise InputError(
-            where,
-            f"{field}: expected a path within the folder, got the absolute {shown(value)}; "
-            "copy the file in and write a relative path",
-        )
-    path = root / value
+        raise InputError(where, f"{expected} within the folder, got the absolute {got}; copy the file in")
     try:
-        real, base = Path(os.path.realpath(path)), Path(os.path.realpath(root))
+        within = is_within(root, root / value)
     except (OSError, ValueError):
-        raise InputError(where, f"{field}: expected the path of a file, got {shown(value)}; correct it") from None
-    if not real.is_relative_to(base):
-        raise InputError(
-            where,
-            f"{field}: expected a file within the folder, got {shown(value)} which leads out of it; copy the file in",
-        )
-    return path
+        raise InputError(where, f"{expected}, got {got}; correct it") from None
+    if not within:
+        raise InputError(where, f"{expected} within the folder, got {got} which leads out of it; copy the file in")
+    return root / value
 
 
-def check_distortion(where: str, lens: Lens, focal: float, reach: tuple[float, float]) -> str | None:
+def is_within(root: Path, path: Path) -> bool:
+    """Whether ``path`` is below ``root`` after links are followed."""
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root))
+
+
+def check_distortion(where: str, lens: Lens, focal: float, reach: tuple[float, float]) -> list[str]:
     """A note if ``lens`` has distortion of at most MAX_DISTORTION_PIXELS.  Raises InputError for larger distortion.
 
     reach: largest distance of pixels from the principal point, in x and y.
     """
     if not any(lens.radial + lens.tangential):
-        return None
-    try:
-        moved = distortion_pixels(focal, reach, lens.radial, lens.tangential)
-    except OverflowError:  # a focal length next to nothing
-        moved = math.inf
+        return []
+    moved = distortion_pixels(focal, reach, lens.radial, lens.tangential)
     if not moved <= MAX_DISTORTION_PIXELS:
-        raise InputError(
-            where,
-            f"distortion: expected an undistorted lens, got a displacement of {moved:.3g} pixels; undistort the images "
-            "(colmap image_undistorter)",
-        )
-    return f"{where}: lens distortion of at most {moved:.2g} pixels ignored"
+        got = f"expected an undistorted lens, got a displacement of {moved:.3g} pixels"
+        raise InputError(where, f"distortion: {got}; undistort the images (colmap image_undistorter)")
+    return [f"{where}: lens distortion of at most {moved:.2g} pixels ignored"]
 
 
 def distortion_pixels(
@@ -184,12 +143,10 @@ def distortion_pixels(
     before it.
     """
     p1, p2 = tangential or (0.0, 0.0)
-    largest = 0.0
-    for step in range(1, RADII + 1):
-        x, y = (v / focal * step / RADII for v in reach)
+    with np.errstate(all="ignore"):  # a focal length next to nothing gives infinity or NaN
+        x, y = np.outer(np.divide(reach, focal), np.arange(1, RADII + 1) / RADII)
         r2 = x * x + y * y
-        factor = abs(sum(k * r2 ** (i + 1) for i, k in enumerate(radial)))
-        dx = x * factor + abs(2 * p1 * x * y) + abs(p2 * (r2 + 2 * x * x))
-        dy = y * factor + abs(p1 * (r2 + 2 * y * y)) + abs(2 * p2 * x * y)
-        largest = max(largest, focal * math.hypot(dx, dy))
-    return largest
+        factor = np.abs(np.polyval((*radial[::-1], 0.0), r2))
+        dx = x * factor + abs(2 * p1) * x * y + abs(p2) * (r2 + 2 * x * x)
+        dy = y * factor + abs(p1) * (r2 + 2 * y * y) + abs(2 * p2) * x * y
+        return float((focal * np.hypot(dx, dy)).max())

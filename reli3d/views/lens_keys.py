@@ -29,14 +29,8 @@ MIN_FOV = 1e-6  # radians: the tangent of a much smaller angle is 0
 AGREE = 0.02  # relative difference up to which two spellings of one focal length agree
 _PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE", "PERSP")
 _MATRICES = (
-    "intrinsics",
-    "K",
-    "intrinsic_matrix",
-    "intrinsics_matrix",
-    "intrinsic",
-    "camera_intrinsics",
-    "camera_matrix",
-    "cam_K",
+    *("intrinsics", "K", "intrinsic_matrix", "intrinsics_matrix", "intrinsic"),
+    *("camera_intrinsics", "camera_matrix", "cam_K"),
 )
 _FOCALS = (("fl_x", "fl_y"), ("fx", "fy"))
 _ANGLES = (("x_fov", "y_fov", math.pi / 180), ("camera_angle_x", "camera_angle_y", 1.0))
@@ -45,10 +39,7 @@ _SIDES = (("w", "width", "image_width"), ("h", "height", "image_height"))
 _SIZES = ("resolution", "img_wh", "image_size", "img_size")  # width and height in a list
 _RADIAL, _TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
 _READ = {
-    *_MATRICES,
-    *_FOVS,
-    *_RADIAL,
-    *_TANGENTIAL,
+    *(*_MATRICES, *_FOVS, *_RADIAL, *_TANGENTIAL),
     *(key for pair in (*_FOCALS, *_ANGLES, *_SIDES) for key in pair if isinstance(key, str)),
     *("cx", "cy", "camera_principal_point", "focal_length", "sensor_width"),
 }
@@ -93,24 +84,19 @@ def check_keys(where: str, values: dict) -> None:
         is_index = word in ("camera", "cam") and isinstance(value, int)
         if key in _READ or _nothing(value) or _NO_LENS.fullmatch(word) or is_index:
             continue
-        if _MODEL.fullmatch(word) and isinstance(value, str):
+        text, expected, fix = isinstance(value, str), "", "undistort the images first"
+        if text and _MODEL.fullmatch(word):
             if re.sub(r"[^A-Z0-9]+", "_", value.upper().strip()) not in _PINHOLE:
-                raise InputError(
-                    where, f"{key}: expected a pinhole camera, got {shown(value)}; undistort the images first"
-                )
+                expected = "a pinhole camera"
         elif _no_pinhole(key, value):
-            raise InputError(where, f"{key}: expected a pinhole camera, got {shown(value)}; undistort the images first")
-        elif (_BENT.fullmatch(word) and not (word.startswith("s") and isinstance(value, str))) or (
-            word in _COEFFICIENTS and isinstance(value, list)
-        ):
-            raise InputError(
-                where, f"{key}: expected 0 or none, as it is not read, got {shown(value)}; undistort the images first"
-            )
-        elif _LENS.fullmatch(word) and not _words(value):
-            expected = "fl_x in pixels, camera_angle_x in radians or a 3x3 matrix intrinsics"
-            problem = f"{key}: expected {expected}, got a key of the lens that is not read, {shown(value)}"
-            raise InputError(where, f"{problem}; write one of these and remove it")
-
+            expected = "a pinhole camera"
+        elif _BENT.fullmatch(word) and (word[0] != "s" or not text) or word in _COEFFICIENTS and type(value) is list:
+            expected = "0 or none, as it is not read"
+        elif _LENS.fullmatch(word) and not (text and not re.match(r"\s*[-+.]?\d", value)):  # not a name
+            expected = "fl_x in pixels, camera_angle_x in radians or a 3x3 matrix intrinsics, as it is not read"
+            fix = "write one of these and remove it"
+        if expected:
+            raise InputError(where, f"{key}: expected {expected}, got {shown(value)}; {fix}")
     for key, entry in _inner(values):
         for name, value in entry.items():
             if _no_pinhole(name, value):
@@ -135,16 +121,6 @@ def _inner(values: dict) -> Iterator[tuple[str, dict[str, object]]]:
                 yield from ((key, e) for e in (entry, *entry.values()) if isinstance(e, dict))
 
 
-def _check_inner(where: str, values: dict) -> None:
-    """Raises InputError for an object in ``values`` that holds a lens, where no other lens is known."""
-    for key, entry in _inner(values):
-        for name in map(str, entry):
-            if name in _READ or _LENS.fullmatch(_word(name)):
-                problem = f"{key}: expected the lens in the frame or the file, got {shown(name)} within {key}"
-                fix = "which is not read; write it into the object that has transform_matrix"
-                raise InputError(where, f"{problem}, {fix}")
-
-
 def _word(text: str) -> str:
     return re.sub(r"[^a-z0-9]", "", text.lower())
 
@@ -154,11 +130,6 @@ def _nothing(value: object) -> bool:
     if isinstance(value, list):
         return all(_nothing(v) for v in value)
     return value is None or value in (False, 0) or value in ("", "false", "False", "none", "None")
-
-
-def _words(value: object) -> bool:
-    """Whether ``value`` is a name rather than a quantity."""
-    return isinstance(value, str) and not re.match(r"\s*[-+.]?\d", value)
 
 
 def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
@@ -188,8 +159,11 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
                 lens = replace(lens, size=size)
             break
     if lens is None:
-        _check_inner(where, frame)
-        _check_inner(where, data)
+        for key, entry in (*_inner(frame), *_inner(data)):
+            if name := next((n for n in map(str, entry) if n in _READ or _LENS.fullmatch(_word(n))), None):
+                problem = f"{key}: expected the lens in the frame or the file, got {shown(name)} within {key}"
+                fix = "which is not read; write it into the object that has transform_matrix"
+                raise InputError(where, f"{problem}, {fix}")
         notes.append(f"{where}: no field of view given, {DEFAULT_FOV} radians assumed as in the ReLi3D release")
         lens = Lens(fov=(DEFAULT_FOV, math.nan), center=center)
     radial, tangential = (tuple(found(k) or 0.0 for k in keys) for keys in (_RADIAL, _TANGENTIAL))
@@ -221,7 +195,11 @@ def _spellings(
             yield (x_key, y_key), Lens(fov=(x, y)), (_widths(x), _widths(y))
     for key in _FOVS:
         if key in source:
-            fov = _fov(where, key, source[key])
+            value = source[key][0] if isinstance(source[key], list) and len(source[key]) == 1 else source[key]
+            if isinstance(value, list):
+                fov = _pair(where, key, value, MIN_FOV, math.pi)
+            else:
+                fov = number(where, key, value, MIN_FOV, math.pi), math.nan  # square pixels
             yield (key, key), Lens(fov=fov), (_widths(fov[0]), math.nan)  # some write the field across twice
     if "focal_length" in source:
         sensor = source.get("sensor_width", data.get("sensor_width"))
@@ -263,11 +241,11 @@ def _size(where: str, frame: dict, data: dict) -> tuple[int, int] | None:
         return None
 
     w, h = side(0), side(1)
-    if any(side is not None and side < 1 for side in (w, h)):
-        raise InputError(where, f"w, h: expected at least 1 pixel, got {w} x {h}; correct the camera file")
-    if (w is None) != (h is None):
-        raise InputError(where, f"w, h: expected both or none, got {w} x {h}; write the size of the images")
-    return None if w is None or h is None else (int(w), int(h))
+    if w is None and h is None:
+        return None
+    if w is None or h is None or min(w, h) < 1:
+        raise InputError(where, f"w, h: expected both, at least 1 pixel, got {w} x {h}; write the size of the images")
+    return int(w), int(h)
 
 
 def _center(where: str, frame: dict, data: dict) -> tuple[float, float] | None:
@@ -298,20 +276,9 @@ def _matrix(where: str, key: str, value: object) -> tuple[float, float, float, f
     m = np.array([[number(where, key, v, -1e9, 1e9) for v in row[:3]] for row in rows[:3]])
     fx, fy, cx, cy = m[0, 0], m[1, 1], m[0, 2], m[1, 2]
     if not (min(fx, fy) > 0 and np.abs(m[2] - (0, 0, 1)).max() < 1e-6 and abs(m[1, 0]) + abs(m[0, 1]) <= MAX_SKEW * fx):
-        raise InputError(
-            where,
-            f"{key}: expected the rows fx 0 cx, 0 fy cy, 0 0 1 in pixels with fx and fy above 0, got "
-            f"{shown(m.tolist(), 120)}; correct the camera file",
-        )
+        expected = "expected the rows fx 0 cx, 0 fy cy, 0 0 1 in pixels with fx and fy above 0"
+        raise InputError(where, f"{key}: {expected}, got {shown(m.tolist(), 120)}; correct the camera file")
     return float(fx), float(fy), float(cx), float(cy)
-
-
-def _fov(where: str, key: str, value: object) -> tuple[float, float]:
-    if isinstance(value, list) and len(value) == 1:
-        value = value[0]
-    if isinstance(value, list):
-        return _pair(where, key, value, MIN_FOV, math.pi)
-    return number(where, key, value, MIN_FOV, math.pi), math.nan  # square pixels
 
 
 def _pair(where: str, key: str, value: object, low: float, high: float) -> tuple[float, float]:

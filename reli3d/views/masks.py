@@ -1,6 +1,8 @@
 """Masks of images: which file belongs to which image, and what its pixel values mean."""
 
+import itertools
 import os
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
 
@@ -30,12 +32,8 @@ def mask_values(path: os.PathLike, bitmap: Image.Image, notes: list[str]) -> Ima
     (antialiasing).  Of a mask with two values, black and one below white, nonzero is the object, with a note.  Raises
     InputError, with the values found, for several labels and for masks without black.
     """
-    alpha = used_alpha(bitmap)
-    if alpha is not None:
-        return _coverage(path, alpha, notes)
-    if bitmap.mode in _TOP:
-        return _coverage(path, bitmap, notes)
-    return _color_coverage(path, bitmap.convert("RGB"), notes)
+    channel = used_alpha(bitmap) or (bitmap if bitmap.mode in _TOP else None)
+    return _coverage(path, channel, notes) if channel else _color_coverage(path, bitmap.convert("RGB"), notes)
 
 
 def alpha_values(bitmap: Image.Image, notes: list[str]) -> Image.Image | None:
@@ -81,9 +79,8 @@ def check_one_label(folder: os.PathLike, notes: Sequence[str]) -> None:
     """Raises InputError where the notes of several masks name different values or colors of the object."""
     labels = sorted({note.removeprefix(LABEL).partition(" instead")[0] for note in notes if note.startswith(LABEL)})
     if len(labels) > 1:
-        raise InputError(
-            folder, f"masks: expected one label in all masks, got {', '.join(labels[:4])}; save masks of one object"
-        )
+        expected = f"expected one label in all masks, got {', '.join(labels[:4])}"
+        raise InputError(folder, f"masks: {expected}; save masks of one object")
 
 
 def _coverage(path: os.PathLike, channel: Image.Image, notes: list[str]) -> Image.Image:
@@ -165,21 +162,17 @@ class MaskFiles:
     def __init__(self, root: Path, frames: Sequence[Frame], folder: Path | None):
         self.given, self._root, self._index = folder, root, FolderIndex()
         self._folders = [folder] if folder is not None else [root / name for name in named(root, FOLDERS)]
-        self._images: dict[str, list[Path]] = {}  # of each mask file
-        images = {os.path.realpath(frame.image): frame.image for frame in frames}
-        for image in (*images.values(), *self._other_images(images)):
-            if (found := self._find(image)) is not None:
-                self._images.setdefault(os.path.realpath(found), []).append(image)
-        for frame in frames:
-            if frame.mask is not None:
-                others = self._images.setdefault(os.path.realpath(frame.mask), [])
-                if os.path.realpath(frame.image) not in map(os.path.realpath, others):
-                    others.append(frame.image)
+        self._images: dict[str, dict[str, Path]] = defaultdict(dict)  # of each mask file, by their real paths
+        images = list({os.path.realpath(frame.image): frame.image for frame in frames}.values())
+        pairs = [(self._find(image), image) for image in (*images, *self._other_images(images))]
+        for mask, image in (*pairs, *((frame.mask, frame.image) for frame in frames)):
+            if mask is not None:
+                self._images[os.path.realpath(mask)].setdefault(os.path.realpath(image), image)
 
-    def _other_images(self, images: dict[str, Path]) -> Iterator[Path]:
+    def _other_images(self, images: list[Path]) -> Iterator[Path]:
         """Images in nested folders that are no frames: a mask named after one of these may be another's."""
-        frames = {(image.parent, image.stem) for image in images.values()}  # the same photograph in another format
-        tops = {part.parts[0] for part in map(self._relative, images.values()) if len(part.parts) > 2}
+        frames = {(image.parent, image.stem) for image in images}  # the same photograph in another format
+        tops = {part.parts[0] for part in map(self._relative, images) if len(part.parts) > 2}
         for top in sorted(tops):
             yield from (p for p in images_below(self._root / top) if (p.parent, p.stem) not in frames)
 
@@ -193,28 +186,19 @@ class MaskFiles:
         relative = self._relative(image)
         endings = [e for ending in ENDINGS for e in (ending, ending.upper())]
         names = (image.name, *(stem + ending for stem in (image.stem, image.name) for ending in endings))
-        for folder in self._folders:
-            for first in range(len(relative.parts)):
-                for name in dict.fromkeys(names):
-                    found = self._index.find(folder, PurePath(*relative.parts[first:-1], name))
-                    if found is not None and os.path.isfile(found):
-                        return found
-        return None
+        parts = [relative.parts[first:-1] for first in range(len(relative.parts))]
+        places = itertools.product(self._folders, parts, dict.fromkeys(names))
+        found = (self._index.find(folder, PurePath(*part, name)) for folder, part, name in places)
+        return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
     def of(self, frame: Frame) -> Path | None:
-        """The mask file of ``frame``: in ``folder`` where one is given, its own, or found by name; None without any.
-
-        Raises InputError where it is that of another image as well.
-        """
+        """The mask file of ``frame``: given, its own, or found by name; InputError if it is another image's as well."""
         mask = self._find(frame.image) if self.given or frame.mask is None else frame.mask
         if mask is None:
             return None
-        images = self._images.get(os.path.realpath(mask), [])
-        if len({os.path.realpath(p) for p in images}) > 1:
-            first, second = (self._relative(p).as_posix() for p in images[:2])
-            raise InputError(
-                mask,
-                f"expected the mask of one image, got that of {shown(first)} and {shown(second)}; put masks into "
-                "sub-folders as the images are",
-            )
+        images = [self._relative(path).as_posix() for path in self._images[os.path.realpath(mask)].values()]
+        if len(images) > 1:
+            first, second, *_ = images
+            got = f"that of {shown(first)} and {shown(second)}"
+            raise InputError(mask, f"expected the mask of one image, got {got}; put masks into sub-folders as images")
         return mask

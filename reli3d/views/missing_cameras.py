@@ -34,9 +34,7 @@ def no_cameras(source: Path) -> InputError:
         if not photographs and (videos := images_in(place, VIDEOS)):
             return _capture(source, videos[0], f"{len(videos)} video{'s' if len(videos) > 1 else ''}")
         if raw := images_in(place, RAW):
-            return InputError(
-                raw[0], "expected JPEG, HEIC or PNG photographs; convert them, at full size and uncropped"
-            )
+            return InputError(raw[0], "expected JPEG, HEIC or PNG photographs; convert them, full size and uncropped")
     ready = [p for p in folders if any((p / name).exists() for name in CAMERA_FILES)]
     if ready:
         return InputError(source, f"expected one object, got {len(ready)} folders of objects; give {_quoted(ready[0])}")

@@ -35,6 +35,10 @@ class Hull:
     aim: Tensor  # (3,) where the views look
     extent: float  # longest lateral side of the masks at ``aim``
 
+    def middle(self) -> Tensor:
+        """Mean of the cells, or where the views look if there are none."""
+        return self.points.mean(0) if len(self.points) else self.aim
+
     def box(self) -> tuple[Tensor, Tensor]:
         """Lower and upper corner ``(3,)``, to half a cell.  Raises InputError for an empty hull."""
         if len(self.points) == 0:
@@ -61,20 +65,17 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
     if mode == "auto" and views.object_box is not None:
         low, high = torch.tensor(views.object_box, dtype=torch.float64, device="cpu")
         longest = float((high - low).max())
-        return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64, device="cpu"), -(low + high) / (2 * longest))
+        return Similarity.without_rotation(-(low + high) / (2 * longest), 1.0 / longest)
     hull = visual_hull(views)
     low, high = hull.box()
-    inside = (
-        float(torch.maximum(-low, high).max()) <= MAX_HULL_COORDINATE
-        and float(hull.points.norm(dim=-1).max()) <= RADIUS
-    )
+    inside = torch.maximum(-low, high).max() <= MAX_HULL_COORDINATE and hull.points.norm(dim=-1).max() <= RADIUS
     basis = _one_sided_basis(views, hull)
     points = hull.points @ basis
     low, high = points.amin(0), points.amax(0)
     longest, center = float((high - low).max()), basis @ ((low + high) / 2)
     if mode == "auto" and inside and KEPT_HULL_SIDE[0] <= longest <= KEPT_HULL_SIDE[1]:
         return Similarity.identity()
-    return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64, device="cpu"), -center / longest)
+    return Similarity.without_rotation(-center / longest, 1.0 / longest)
 
 
 def _one_sided_basis(views: Views, hull: Hull) -> Tensor:
@@ -119,9 +120,8 @@ def visual_hull(views: Views) -> Hull:
     low, high = aim - ball, aim + ball
     for grid in GRIDS:
         cell = float((high - low).max()) / grid
-        axes = [
-            torch.arange(math.ceil(float(h - l) / cell), dtype=torch.float64, device="cpu") for l, h in zip(low, high)
-        ]
+        counts = ((high - low) / cell).ceil().int().tolist()
+        axes = [torch.arange(n, dtype=torch.float64, device="cpu") for n in counts]
         points = low + (torch.cartesian_prod(*axes) + 0.5) * cell
         points = points[(points - aim).norm(dim=-1) <= ball]
         for mask, pose, camera in zip(masks, c2w, intrinsics):

@@ -5,6 +5,7 @@ without antialiasing, mask thresholded at one half after resizing.  The network 
 uses the same steps, listed in docs/model.md.
 """
 
+import contextlib
 import io
 
 import numpy as np
@@ -96,9 +97,8 @@ def has_background(image: Tensor, mask: Tensor) -> bool:
 
 def placement_notes(views: Views) -> tuple[str, ...]:
     """Notes on poses that are used as stored: none if the object fills the network's cube, else one line."""
-    try:
-        placed = normalize(views, "auto").is_identity()
-    except InputError:  # masks that do not meet
-        placed = False
+    with contextlib.suppress(InputError):  # masks that do not meet
+        if normalize(views, "auto").is_identity():
+            return ()
     text = "poses go in as stored, but the object does not sit in the network's cube of half side 0.87 about the origin"
-    return () if placed else (f"{text}; try --normalize auto",)
+    return (f"{text}; try --normalize auto",)

@@ -44,12 +44,11 @@ def cut(size: tuple[int, int], inside: np.ndarray, *, whole: bool) -> Cut | None
     if whole:
         scale, part = math.sqrt(MAX_FULL_PIXELS / (width * height)), (0, 0, width, height)
     else:
-        columns, rows = (np.flatnonzero(inside.any(axis)) for axis in (0, 1))
-        x0, y0, x1, y1 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+        columns, rows = (np.flatnonzero(inside.any(axis)).tolist() for axis in (0, 1))
+        x0, y0, x1, y1 = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
         side = max(x1 - x0, y1 - y0)
         reach = math.ceil(0.5 * MARGIN * side)
         x, y = (x0 + x1) // 2, (y0 + y1) // 2
         scale = min(1.0, MAX_OBJECT_PIXELS / side)
         part = max(0, x - reach), max(0, y - reach), min(width, x + reach), min(height, y + reach)
-    columns_kept, rows_kept = part[2] - part[0], part[3] - part[1]
-    return Cut(part, (max(1, round(scale * columns_kept)), max(1, round(scale * rows_kept))))
+    return Cut(part, (max(1, round(scale * (part[2] - part[0]))), max(1, round(scale * (part[3] - part[1])))))

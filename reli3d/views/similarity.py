@@ -1,6 +1,6 @@
 """Similarity transforms between frames: a rotation, one scale and a translation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -8,13 +8,13 @@ from torch import Tensor
 from reli3d._bridge import full_precision
 from reli3d.errors import InputError
 
-UP = {  # rotations that carry an axis to +Y
-    "y": torch.eye(3, dtype=torch.float32, device="cpu"),
-    "-y": torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float32, device="cpu")),
-    "x": torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float32, device="cpu"),
-    "-x": torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float32, device="cpu"),
-    "z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float32, device="cpu"),
-    "-z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float32, device="cpu"),
+UP = {  # rows of the rotation that carries an axis to +Y
+    "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+    "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+    "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "-z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
 }
 
 
@@ -27,10 +27,13 @@ class Similarity:
     translation: Tensor  # (3,)
 
     @staticmethod
+    def without_rotation(translation: Tensor, scale: float = 1.0) -> "Similarity":
+        """``x -> scale * x + translation``; translation: float64, on the CPU."""
+        return Similarity(scale, torch.eye(3, dtype=torch.float64, device="cpu"), translation)
+
+    @staticmethod
     def identity() -> "Similarity":
-        return Similarity(
-            1.0, torch.eye(3, dtype=torch.float64, device="cpu"), torch.zeros(3, dtype=torch.float64, device="cpu")
-        )
+        return Similarity.without_rotation(torch.zeros(3, dtype=torch.float64, device="cpu"))
 
     def matrix(self) -> Tensor:
         """``(4, 4)`` float64 matrix on column vectors."""
@@ -59,15 +62,11 @@ class Similarity:
 
     def is_identity(self) -> bool:
         """Whether the transform is exactly the identity."""
-        same = torch.equal(self.rotation, torch.eye(3, dtype=torch.float64, device="cpu"))
-        return self.scale == 1.0 and same and not bool(self.translation.any())
+        return torch.equal(self.matrix(), torch.eye(4, dtype=torch.float64, device="cpu"))
 
 
 def output_frame(up: str) -> Similarity:
-    """Transform to the asset frame, whose +Y is the axis ``up`` of the input cameras' frame.
-
-    Raises InputError for an invalid ``up``.
-    """
+    """Transform to the asset frame, whose +Y is the axis ``up`` of the input cameras' frame; else InputError."""
     if up not in UP:
         raise InputError("up", f"expected one of {', '.join(UP)}, got {up}")
-    return Similarity(1.0, UP[up].double(), torch.zeros(3, dtype=torch.float64, device="cpu"))
+    return replace(Similarity.identity(), rotation=torch.tensor(UP[up], dtype=torch.float64, device="cpu"))

@@ -5,6 +5,7 @@ not applied.  :mod:`reli3d.views.lens_keys` reads the lens.
 """
 
 import json
+from collections import Counter
 from pathlib import Path
 
 from reli3d.errors import InputError, shown
@@ -18,9 +19,20 @@ MAX_FRAMES = 4096  # a video at 30 frames a second for two minutes
 
 def read_json(path: Path) -> dict:
     """The object in a JSON file of at most 16 MB, without NaN, infinity or duplicate keys.  Raises InputError."""
+
+    def reject(word: str):
+        raise InputError(path, f"expected finite numbers, got {word}; correct the file")
+
+    def unique(pairs: list) -> dict:
+        result = dict(pairs)
+        if len(result) != len(pairs):
+            key = Counter(key for key, _ in pairs).most_common(1)[0][0]
+            raise InputError(path, f"expected every key once, got {shown(key)} twice; correct the file")
+        return result
+
     try:
         text = read_bytes(path, MAX_BYTES).decode("utf-8-sig")
-        value = json.loads(text, parse_constant=_reject, object_pairs_hook=_unique)
+        value = json.loads(text, parse_constant=reject, object_pairs_hook=unique)
     except InputError:
         raise
     except UnicodeDecodeError as error:
@@ -29,34 +41,11 @@ def read_json(path: Path) -> dict:
         raise InputError(path, "expected a flat JSON file, got one nested too deep; export the cameras again") from None
     except json.JSONDecodeError as error:
         raise InputError(path, f"line {error.lineno}: expected JSON ({error.msg}); correct the file") from None
-    except _Rejected as error:
-        raise InputError(path, f"{error}; correct the file") from None
     except ValueError:
         raise InputError(path, "expected numbers, got an integer of thousands of digits; correct the file") from None
     if not isinstance(value, dict):
-        raise InputError(
-            path, f"expected a JSON object with frames, got {type(value).__name__}; export the cameras again"
-        )
+        raise InputError(path, f"expected an object with frames, got {type(value).__name__}; export the cameras again")
     return value
-
-
-class _Rejected(ValueError):
-    """JSON that Python would read and we do not."""
-
-
-def _reject(word: str):
-    raise _Rejected(f"expected finite numbers, got {word}")
-
-
-def _unique(pairs: list) -> dict:
-    result = dict(pairs)
-    if len(result) != len(pairs):
-        seen: set[str] = set()
-        for key, _ in pairs:
-            if key in seen:
-                raise _Rejected(f"expected every key once, got {shown(key)} twice")
-            seen.add(key)
-    return result
 
 
 def read_transforms(path: Path) -> tuple[list[Frame], list[str]]:
@@ -90,19 +79,15 @@ def _frame(path: Path, index: int, frame: dict, data: dict) -> Frame:
     where = f"{path}: frames[{index}]"
     key = next((k for k in ("transform_matrix", "camera_transform") if frame.get(k) is not None), None)
     if key is None:
-        raise InputError(
-            where, "transform_matrix: expected the camera-to-world matrix, got none; export the cameras again"
-        )
+        raise InputError(where, "transform_matrix: expected the camera-to-world matrix, got none; export again")
     image = file_within(path.parent, where, "file_path", frame.get("file_path"))
     mask = frame.get("mask_path")
     mask = None if mask is None else file_within(path.parent, where, "mask_path", mask)
     check_keys(where, frame)
     notes: list[str] = []
     lens = lens_of(where, frame, data, notes)
-    pose, lighting = rigid(where, key, frame[key]), data.get("lighting", "object")
-    return Frame(
-        where, str(frame["file_path"]), image, mask, pose, lens, tuple(notes), lighting, _object_box(path, data)
-    )
+    pose, lighting, box = rigid(where, key, frame[key]), data.get("lighting", "object"), _object_box(path, data)
+    return Frame(where, str(frame["file_path"]), image, mask, pose, lens, tuple(notes), lighting, box)
 
 
 def _object_box(path: Path, data: dict) -> tuple[tuple[float, ...], ...] | None:

@@ -6,6 +6,7 @@ Color is sRGB in [0, 1] with straight alpha, including the background.  Cameras 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -70,10 +71,9 @@ class Views(Movable):
         check("intrinsics", self.intrinsics, last=4, like=self.c2w)
         if count == 0:
             raise ValueError("images: expected at least one view, got none")
-        if self.c2w.shape != (count, 4, 4):
-            raise ValueError(f"c2w: expected shape ({count}, 4, 4), got {tuple(self.c2w.shape)}")
-        if self.intrinsics.shape != (count, 4):
-            raise ValueError(f"intrinsics: expected shape ({count}, 4), got {tuple(self.intrinsics.shape)}")
+        for name, value, shape in (("c2w", self.c2w, (count, 4, 4)), ("intrinsics", self.intrinsics, (count, 4))):
+            if value.shape != shape:
+                raise ValueError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
         if len(self.masks) != count or len(self.names) != count:
             raise ValueError(f"masks, names: expected {count} each, got {len(self.masks)} and {len(self.names)}")
         for i, (image, mask) in enumerate(zip(self.images, self.masks)):
@@ -95,17 +95,8 @@ class Views(Movable):
         indices = list(range(which)) if isinstance(which, int) else list(which)
         if not indices or min(indices) < 0 or max(indices) >= len(self):
             raise ValueError(f"which: expected 1 to {len(self)} views of {len(self)}, got {which}")
-        images, masks = (tuple(t[i] for i in indices) for t in (self.images, self.masks))
-        names = tuple(self.names[i] for i in indices)
-        return replace(
-            self,
-            images=images,
-            masks=masks,
-            names=names,
-            c2w=self.c2w[indices],
-            intrinsics=self.intrinsics[indices],
-            chosen=None,
-        )
+        lists: dict[str, Any] = {k: tuple(getattr(self, k)[i] for i in indices) for k in ("images", "masks", "names")}
+        return replace(self, **lists, c2w=self.c2w[indices], intrinsics=self.intrinsics[indices], chosen=None)
 
     def taken(self) -> "Views":
         """The views for the network: the views in ``chosen``, or all views if ``chosen`` is None."""
@@ -143,9 +134,8 @@ class Views(Movable):
                 pixels[:3] = linear_to_srgb(pixels[:3].clamp(0.0, 1.0))
             images[k] = pixels[:3].permute(1, 2, 0).clamp(0.0, 1.0)
             masks[k], silhouettes[k] = pixels[3:].clamp(0.0, 1.0)
-            scale = camera.new_tensor([size / width, size / height])
-            origin = camera.new_tensor([x, y])
-            intrinsics.append(torch.cat([camera[:2] * scale, (camera[2:] - origin) * scale]))
+            scale = camera.new_tensor([size / width, size / height] * 2)
+            intrinsics.append((camera - camera.new_tensor([0, 0, x, y])) * scale)
         cameras = torch.stack(intrinsics).to(self.intrinsics.dtype)
         return ViewBatch(images, masks, self.c2w, cameras, silhouettes)
 

@@ -29,15 +29,12 @@ def sky(height: int = 16, seed: int = 0, spread: float = 3.0) -> torch.Tensor:
     return image
 
 
-def test_float_exr_is_exact(tmp_path):
+def test_exr_keeps_float_exactly_and_half_to_eleven_bits(tmp_path):
     assert write_exr(tmp_path / "a.exr", sky(), half=False) == 0
     assert torch.equal(read_hdr_image(tmp_path / "a.exr"), sky())
-
-
-def test_half_exr_keeps_eleven_bits(tmp_path):
     image = sky().clamp_min(6.2e-5)  # the smallest normal half; below it precision falls
-    assert write_exr(tmp_path / "a.exr", image) == 0
-    torch.testing.assert_close(read_hdr_image(tmp_path / "a.exr"), image, rtol=2**-11, atol=0)  # half of 2^-10
+    assert write_environment(tmp_path / "b.exr", Environment(image)) == 0
+    torch.testing.assert_close(read_environment(tmp_path / "b.exr").radiance, image, rtol=2**-11, atol=0)  # of 2^-10
 
 
 def test_values_a_file_cannot_hold_are_clamped_and_counted(tmp_path):
@@ -52,20 +49,25 @@ def test_values_a_file_cannot_hold_are_clamped_and_counted(tmp_path):
 
 
 @pytest.mark.parametrize("write", [write_exr, write_hdr])
-@pytest.mark.parametrize("bad", [math.nan, -1e-6])
-def test_nan_and_negative_are_never_written(tmp_path, write, bad):
-    image = sky()
-    image[4, 4, 1] = bad
-    with pytest.raises(ValueError, match="image: expected values >= 0"):
-        write(tmp_path / "a", image)
+def test_what_is_no_image_is_never_written(tmp_path, write):
+    for bad in (math.nan, -1e-6):
+        image = sky()
+        image[4, 4, 1] = bad
+        with pytest.raises(ValueError, match="image: expected values >= 0"):
+            write(tmp_path / "a", image)
     with pytest.raises(TypeError):
-        write(tmp_path / "a", image.double())
+        write(tmp_path / "a", sky().double())
     with pytest.raises(ValueError, match="shape"):
-        write(tmp_path / "a", image[..., :2])
+        write(tmp_path / "a", sky()[..., :2])
+    with pytest.raises(OSError):
+        write(tmp_path / "none" / "a", sky())
+    for name, image, message in (("a.png", sky(), "path: expected"), ("a.exr", sky()[:8], "expected a map")):
+        with pytest.raises(ValueError, match=message):
+            write_environment(tmp_path / name, Environment(image))
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("height", [1, 3, 4, 8, 16, 130])
+@pytest.mark.parametrize("height", [1, 3, 8, 130])
 def test_rgbe_keeps_each_pixel_to_a_256th_of_its_largest_channel(tmp_path, height):
     image = sky(height, seed=height) if height > 3 else torch.rand(height, 2 * height, 3)
     write_hdr(tmp_path / "a.hdr", image)
@@ -141,27 +143,6 @@ def test_mitsuba_sees_the_sun_where_we_put_it(tmp_path, suffix):
         assert float(light.eval(it)[0]) < 0.1
 
 
-def test_an_environment_is_read_back(tmp_path):
-    image = sky(8)
-    assert write_environment(tmp_path / "a.exr", Environment(image)) == 0
-    torch.testing.assert_close(
-        read_environment(tmp_path / "a.exr").radiance, image, rtol=2**-11, atol=2**-25
-    )  # half floats
-    columns = torch.arange(6.0)[None, :, None].expand(3, 6, 3).contiguous()
-    write_exr(tmp_path / "odd.exr", columns, half=False)
-    assert torch.equal(read_environment(tmp_path / "odd.exr").radiance, columns)
-
-
-def test_an_environment_is_refused_by_name_and_shape(tmp_path):
-    for path, image, message in (
-        ("a.png", sky(), "path: expected"),
-        ("a.exr", sky()[:8], "environment: expected a map"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            write_environment(tmp_path / path, Environment(image))
-    assert list(tmp_path.iterdir()) == []
-
-
 def window(*corners: int) -> tuple[np.ndarray, np.ndarray]:
     """Left, top, right, bottom, all inside, as the binding takes them."""
     return np.array(corners[:2], np.int32), np.array(corners[2:], np.int32)
@@ -203,15 +184,13 @@ def test_exr_of_other_writers_reads(tmp_path, options, dtype):
 def test_gray_and_cleaned_pixels(tmp_path):
     gray = np.ones((8, 16), np.float32)
     gray[0, :3] = (np.inf, -2.0, 5e5)
-    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": gray}) as file:
-        file.write(str(tmp_path / "a.exr"))
+    exr(tmp_path / "a.exr", {"Y": gray})
     notes: list[str] = []
     image = read_hdr_image(tmp_path / "a.exr", notes=notes)
     assert image[0, :3, 2].tolist() == [HALF_MAX, 0.0, 5e5]
     assert notes == ["a.exr: 3 infinite values set to 65504, 3 negative to 0"]
     gray[0, 0] = np.nan
-    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": gray}) as file:
-        file.write(str(tmp_path / "a.exr"))
+    exr(tmp_path / "a.exr", {"Y": gray})
     with pytest.raises(InputError, match="NaN at 1 pixels"):
         read_hdr_image(tmp_path / "a.exr")
 
@@ -227,11 +206,10 @@ def test_the_display_window_is_the_image(tmp_path, display):
     notes: list[str] = []
     got = read_hdr_image(tmp_path / "a.exr", notes=notes).numpy()
     assert got.shape == (bottom - top + 1, right - left + 1, 3)
-    for y in range(top, bottom + 1):
-        for x in range(left, right + 1):
-            inside = 2 <= x <= 9 and 3 <= y <= 6
-            expected = [planes[c][y - 3, x - 2] for c in "RGB"] if inside else [0.0] * 3
-            assert got[y - top, x - left].tolist() == expected
+    y, x = np.mgrid[top : bottom + 1, left : right + 1]
+    inside = (x >= 2) & (x <= 9) & (y >= 3) & (y <= 6)
+    stored = np.stack([planes[c] for c in "RGB"], -1)[np.clip(y - 3, 0, 3), np.clip(x - 2, 0, 7)]
+    assert np.array_equal(got, np.where(inside[..., None], stored, 0.0))
     assert [("dataWindow" in note) for note in notes] == ([True] if display != (2, 3, 9, 6) else [])
 
 
@@ -278,15 +256,13 @@ def test_primaries_of_a_radiance_image_are_converted(tmp_path):
     np.testing.assert_allclose(got, stored @ np.array(TO_REC709[REC2020]).T, rtol=0, atol=2e-4)
 
 
-@pytest.mark.parametrize("zero", [b"0", b"0.0000"])
-def test_primaries_of_zero_are_none(tmp_path, zero):
+def test_primaries_of_zero_are_none(tmp_path):
     """Photoshop's header, as of Poly Haven's studio_small_03_1k.hdr."""
-    header = b"#?RADIANCE\n# Made with Adobe Photoshop\nGAMMA=1\nPRIMARIES=%s\nFORMAT=32-bit_rle_rgbe\n\n"
-    header %= b" ".join([zero] * 8)
-    got, expected = (
-        round_trip(tmp_path / "a.hdr", "-Y 6 +X 12", QUADS.tobytes(), h) for h in (header, b"#?RADIANCE\n\n")
-    )
-    np.testing.assert_array_equal(got, expected)
+    expected = round_trip(tmp_path / "a.hdr", "-Y 6 +X 12", QUADS.tobytes(), b"#?RADIANCE\n\n")
+    for zero in (b"0", b"0.0000"):
+        header = b"#?RADIANCE\n# Made with Adobe Photoshop\nGAMMA=1\nPRIMARIES=%s\nFORMAT=32-bit_rle_rgbe\n\n"
+        got = round_trip(tmp_path / "a.hdr", "-Y 6 +X 12", QUADS.tobytes(), header % b" ".join([zero] * 8))
+        np.testing.assert_array_equal(got, expected)
 
 
 def test_colors_outside_rec709_are_clamped_and_counted(tmp_path):
@@ -318,17 +294,13 @@ def test_an_exr_that_would_be_misread_is_refused(tmp_path, planes, header, messa
         read_hdr_image(tmp_path / "a.exr")
 
 
-def test_subsampled_channels_are_refused(tmp_path):
+def test_subsampled_channels_and_several_parts_are_refused(tmp_path):
     exr(tmp_path / "a.exr", {"Y": PLANE})
     data, steps = (tmp_path / "a.exr").read_bytes(), [struct.pack("<iIii", 2, 0, n, n) for n in (1, 2)]
     (tmp_path / "a.exr").write_bytes(data.replace(*steps))
     with pytest.raises(InputError, match="channels: expected one sample for each pixel"):
         read_hdr_image(tmp_path / "a.exr")
-
-
-def test_several_parts_are_refused(tmp_path):
-    parts = [OpenEXR.Part({}, {c: PLANE.copy() for c in "RGB"}, name) for name in ("a", "b")]
-    with OpenEXR.File(parts) as file:
+    with OpenEXR.File([OpenEXR.Part({}, {c: PLANE.copy() for c in "RGB"}, name) for name in ("a", "b")]) as file:
         file.write(str(tmp_path / "a.exr"))
     with pytest.raises(InputError, match="EXR kind: expected one flat image"):
         read_hdr_image(tmp_path / "a.exr")
@@ -426,30 +398,25 @@ def test_exposure_and_color_correction_are_divided_out(tmp_path, head, factor):
     np.testing.assert_allclose(read_hdr_image(path).numpy(), QUADS[..., :3] / 256.0 * factor, rtol=1e-6)
 
 
+SIZE = "-Y 6 +X 12"
+
+
 @pytest.mark.parametrize(
-    "line, message",
+    "line, resolution, message",
     [
-        (b"FORMAT=32-bit_rle_xyze", "FORMAT: expected 32-bit_rle_rgbe"),
-        (b"COLORCORR=1 2", "COLORCORR: expected 3 positive numbers"),
-        (b"EXPOSURE=-1", "EXPOSURE: expected a positive number"),
-        (b"PRIMARIES=0.3 0.3 0.3 0.3 0.3 0.3 0.3 0.3", "PRIMARIES: expected"),
-        (b"PRIMARIES=0.64 0.33", "PRIMARIES: expected"),
+        (b"FORMAT=32-bit_rle_xyze", SIZE, "FORMAT: expected 32-bit_rle_rgbe"),
+        (b"COLORCORR=1 2", SIZE, "COLORCORR: expected 3 positive numbers"),
+        (b"EXPOSURE=-1", SIZE, "EXPOSURE: expected a positive number"),
+        (b"PRIMARIES=0.3 0.3 0.3 0.3 0.3 0.3 0.3 0.3", SIZE, "PRIMARIES: expected"),
+        (b"PRIMARIES=0.64 0.33", SIZE, "PRIMARIES: expected"),
+        (b"#", "-Y 6 -Y 12", "resolution: expected"),
+        (b"#", "Y 6 X 12", "resolution: expected"),
+        (b"#", "-Y 6 +X", "resolution: expected"),
+        (b"#", "-Y -6 +X 12", "resolution: expected"),
+        (b"#", "-Y 6 +X 12 1", "resolution: expected"),
+        (b"#", "-Z 6 +X 12", "resolution: expected"),
     ],
 )
-def test_header_lines_that_cannot_be_applied_are_refused(tmp_path, line, message):
+def test_headers_that_cannot_be_applied_are_refused(tmp_path, line, resolution, message):
     with pytest.raises(InputError, match=message):
-        round_trip(tmp_path / "a.hdr", "-Y 6 +X 12", QUADS.tobytes(), b"#?RADIANCE\n" + line + b"\n\n")
-
-
-@pytest.mark.parametrize(
-    "resolution", ["-Y 6 -Y 12", "Y 6 X 12", "-Y 6 +X", "-Y -6 +X 12", "-Y 6 +X 12 1", "-Z 6 +X 12"]
-)
-def test_resolutions_that_are_none_are_refused(tmp_path, resolution):
-    with pytest.raises(InputError, match="resolution: expected"):
-        round_trip(tmp_path / "a.hdr", resolution, QUADS.tobytes())
-
-
-def test_writing_to_a_place_that_is_not_there_is_an_oserror(tmp_path):
-    for write in (write_exr, write_hdr):
-        with pytest.raises(OSError):
-            write(tmp_path / "none" / "a", sky())
+        round_trip(tmp_path / "a.hdr", resolution, QUADS.tobytes(), b"#?RADIANCE\n" + line + b"\n\n")

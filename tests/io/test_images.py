@@ -42,8 +42,12 @@ def deep_png(path, values):
     )
 
 
-def saver(mode, ending, **options):
+def saver(mode, ending=".png", **options):
     return lambda path: Image.fromarray(SHADES).convert(mode).save(path.with_suffix(ending), **options)
+
+
+def color(v):
+    return v[..., :3]
 
 
 def gray(k):
@@ -52,31 +56,25 @@ def gray(k):
 
 # kind of image: how a file of it is written, expected color, tolerance [of 255]
 ACCEPTED = {
-    "8-bit color": (saver("RGB", ".png"), lambda v: v[..., :3], 0),
-    "8-bit color, TIFF": (saver("RGB", ".tif"), lambda v: v[..., :3], 0),
-    "8-bit color with alpha": (saver("RGBA", ".png"), lambda v: v[..., :3], 0),
-    "8-bit color with alpha, WebP": (saver("RGBA", ".webp", lossless=True, exact=True), lambda v: v[..., :3], 0),
-    "8-bit color with alpha, TIFF": (saver("RGBA", ".tif"), lambda v: v[..., :3], 0),
+    "8-bit color": (saver("RGB"), color, 0),
+    "8-bit color, TIFF": (saver("RGB", ".tif"), color, 0),
+    "8-bit color with alpha": (saver("RGBA"), color, 0),
+    "8-bit color with alpha, WebP": (saver("RGBA", ".webp", lossless=True, exact=True), color, 0),
+    "8-bit color with alpha, TIFF": (saver("RGBA", ".tif"), color, 0),
     "8-bit gray": (lambda p: Image.fromarray(SHADES[..., 0]).save(p), gray(0), 0),
     "1-bit": (lambda p: Image.fromarray(SHADES[..., 0] > 99).save(p), lambda v: (gray(0)(v) > 99) * 255, 0),
     "16-bit gray": (lambda p: Image.fromarray(DEEP[..., 0]).save(p), lambda v: DEEP[..., :1] / 257.0, 0),
-    "16-bit color": (lambda p: deep_png(p, DEEP[..., :3]), lambda v: v[..., :3], 1),  # the low byte is dropped
-    "16-bit color with alpha": (lambda p: deep_png(p, DEEP), lambda v: v[..., :3], 1),
+    "16-bit color": (lambda p: deep_png(p, DEEP[..., :3]), color, 1),  # the low byte is dropped
+    "16-bit color with alpha": (lambda p: deep_png(p, DEEP), color, 1),
     "palette": (lambda p: PALETTE.save(p), lambda v: np.array(PALETTE.convert("RGB")), 0),
     # Pillow's plain conversion to ink and back: each of the two rounds to 8 bits
-    "CMYK": (
-        lambda p: Image.fromarray(SHADES[..., :3]).convert("CMYK").save(p.with_suffix(".tif")),
-        lambda v: v[..., :3],
-        2,
-    ),
+    "CMYK": (lambda p: Image.fromarray(color(SHADES)).convert("CMYK").save(p.with_suffix(".tif")), color, 2),
 }
 REFUSED = {
     "32-bit": lambda p: Image.fromarray(SHADES[..., 0].astype(np.float32)).save(p.with_suffix(".tif")),
-    "LAB": lambda p: Image.fromarray(SHADES[..., :3]).convert("RGB").save(p.with_suffix(".gif")),
-    "AVIF": lambda p: Image.fromarray(SHADES[..., :3]).save(p.with_suffix(".avif")),
-    "several frames": lambda p: Image.fromarray(SHADES).save(
-        p.with_suffix(".tif"), save_all=True, append_images=[Image.fromarray(SHADES)]
-    ),
+    "GIF": saver("RGB", ".gif"),
+    "AVIF": saver("RGB", ".avif"),
+    "several frames": saver("RGBA", ".tif", save_all=True, append_images=[Image.fromarray(SHADES)]),
 }
 
 
@@ -85,9 +83,9 @@ def test_accepted_images_are_read_as_stored(tmp_path, name):
     write, expected, tolerance = ACCEPTED[name]
     write(tmp_path / "a.png")
     (path,) = tmp_path.iterdir()
-    color_of, alpha = read_image(path)
+    values, alpha = read_image(path)
     exact = torch.from_numpy(np.ascontiguousarray(expected(SHADES))).float().expand(SIZE[1], SIZE[0], 3)
-    assert float((color_of * 255 - exact).abs().max()) <= tolerance + 1e-4  # a few ulp of float32 at 255
+    assert float((values * 255 - exact).abs().max()) <= tolerance + 1e-4  # a few ulp of float32 at 255
     assert (alpha is not None) == ("alpha" in name)
     if alpha is not None:
         assert torch.equal((alpha * 255).round().byte(), torch.from_numpy(SHADES[..., 3].copy()))
@@ -101,14 +99,10 @@ def test_refused_images_end_in_one_line(tmp_path, name):
         read_image(path)
 
 
-def test_a_transparent_color_of_a_palette_is_alpha(tmp_path):
+def test_a_transparent_color_of_a_palette_is_alpha_and_cmyk_of_a_jpeg_color(tmp_path):
     flat = Image.fromarray(np.repeat(NOISE[:1, :5, :3], 7, 0)).quantize(8)
     _, alpha = read_image(saved(tmp_path, flat, "key.png", transparency=flat.getpixel((0, 0))))
-    assert float(alpha[0, 0]) == 0.0
-    assert float(alpha.max()) == 1.0
-
-
-def test_cmyk_jpeg_is_read_as_color(tmp_path):
+    assert float(alpha[0, 0]) == 0.0 and float(alpha.max()) == 1.0
     cmyk, _ = read_image(saved(tmp_path, Image.new("CMYK", (16, 16), (0, 255, 255, 0)), "ink.jpg", quality=95))
     assert (cmyk[8, 8] - torch.tensor([1.0, 0.0, 0.0])).abs().max() < 0.03  # JPEG of a flat color: a few 8-bit steps
 
@@ -139,19 +133,14 @@ def test_png_round_trip(tmp_path):
     assert np.asarray(Image.open(tmp_path / "b.png")).tolist() == [[[0, 0, 127], [128, 255, 255]]]
 
 
-@pytest.mark.parametrize(
-    "pixels, error",
-    [
-        (torch.zeros(4, 4, 2), ValueError),
-        (torch.zeros(0, 4, 3), ValueError),
-        (torch.zeros(4, 4, 3).long(), TypeError),
-        (torch.full((4, 4, 3), float("nan")), ValueError),
-        (torch.zeros(4), ValueError),
-    ],
-)
-def test_png_refuses(pixels, error):
-    with pytest.raises(error, match="pixels: expected"):
-        png_bytes(pixels)
+@pytest.mark.parametrize("shape", [(4, 4, 2), (0, 4, 3), (4,)])
+def test_png_refuses(shape):
+    with pytest.raises(ValueError, match="pixels: expected"):
+        png_bytes(torch.zeros(shape))
+    with pytest.raises(TypeError, match="pixels: expected"):
+        png_bytes(torch.zeros(4, 4, 3).long())
+    with pytest.raises(ValueError, match="pixels: expected"):
+        png_bytes(torch.full((4, 4, 3), math.nan))
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
@@ -186,10 +175,8 @@ def test_a_linear_image_is_encoded_by_its_suffix(tmp_path):
     [
         ("a.jpg", torch.ones(4, 4, 3), "path: expected"),
         ("a.hdr", torch.ones(4, 4, 4), "image: expected shape"),
-        ("a.png", torch.ones(4, 4, 2), "image: expected shape"),
-        ("a.exr", torch.ones(0, 4, 3), "image: expected shape"),
+        ("a.exr", torch.ones(0, 4, 2), "image: expected shape"),
         ("a.png", torch.full((4, 4, 3), math.nan), "image: expected finite"),
-        ("a.hdr", torch.full((4, 4, 3), -1.0), "image: expected finite"),
         ("a.exr", torch.full((4, 4, 3), math.inf), "image: expected finite"),
     ],
 )
@@ -219,18 +206,17 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
         write_bytes(tmp_path / "no folder" / "a.png", b"x")
 
 
-def test_files_are_written_with_the_usual_permissions(tmp_path):
-    write_bytes(tmp_path / "a", b"x")
+def test_files_are_written_with_the_usual_permissions_and_any_name_and_read_within_the_limit(tmp_path):
+    write_bytes(tmp_path / "a", b"12345")
     (tmp_path / "b").write_bytes(b"x")
     assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
-
-
-def test_reading_takes_regular_files_within_the_limit(tmp_path):
-    write_bytes(tmp_path / "a", b"12345")
     assert read_bytes(tmp_path / "a", 5) == b"12345"
     for path, limit in ((tmp_path / "a", 4), (tmp_path, 9), (tmp_path / "none", 9), ("a\0b", 9), ("/dev/null", 9)):
         with pytest.raises(InputError):
             read_bytes(path, limit)
+    for name in ("n" * 251 + ".png", "n." + "s" * 253):
+        write_bytes(tmp_path / name, b"data")
+        assert (tmp_path / name).read_bytes() == b"data"
 
 
 def test_messages_are_one_printable_line():

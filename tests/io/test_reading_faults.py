@@ -1,5 +1,7 @@
 """Reading invalid files: an error that names the field, at once, and only ValueError and OSError."""
 
+import base64
+import io
 import json
 import os
 import struct
@@ -11,7 +13,6 @@ import pytest
 from PIL import Image
 
 from reli3d.errors import InputError
-from reli3d.io.files import write_bytes
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment, read_hdr_image
 from reli3d.io.images import read_image
@@ -40,20 +41,18 @@ def transforms(folder, **fields):
 
 
 @pytest.mark.parametrize(
-    "name, value, word",
+    "word, fields",
     [
-        ("w", 0.5, "w, h"),
-        ("h", 1e-300, "w, h"),
-        ("fov_rad", 5e-324, "fov_rad"),
-        ("camera_fov", [0.7, 5e-324], "camera_fov"),
-        ("camera_angle_x", 1e-320, "camera_angle_x"),
+        ("w, h", {"w": 0.5, "h": 8, "fl_x": 9}),
+        ("w, h", {"w": 8, "h": 1e-300, "fl_x": 9}),
+        ("fov_rad", {"fov_rad": 5e-324}),
+        ("camera_fov", {"camera_fov": [0.7, 5e-324]}),
+        ("camera_angle_x", {"camera_angle_x": 1e-320}),
     ],
 )
-def test_lenses_that_divide_by_zero(tmp_path, name, value, word):
+def test_lenses_that_divide_by_zero(tmp_path, word, fields):
     with pytest.raises(InputError, match=word):
-        read_transforms(
-            transforms(tmp_path, **{"w": 8, "h": 8, "fl_x": 9, name: value} if name in "wh" else {name: value})
-        )
+        read_transforms(transforms(tmp_path, **fields))
 
 
 def test_a_focal_length_next_to_nothing_with_distortion():
@@ -76,12 +75,6 @@ def test_many_keys_with_one_duplicate(tmp_path):
     path.write_text("{" + ",".join(f'"{k}":0' for k in range(200_000)) + ',"199999":0}')
     with pytest.raises(InputError, match="'199999' twice"):
         read_json(path)
-
-
-def test_names_of_255_letters(tmp_path):
-    write_bytes(tmp_path / ("n" * 251 + ".png"), b"data")
-    write_bytes(tmp_path / ("n." + "s" * 253), b"data")
-    assert len(list(tmp_path.iterdir())) == 2
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
@@ -126,16 +119,11 @@ def test_a_thousand_scans_are_refused_and_ten_are_not(tmp_path):
     assert read_image(tmp_path / "a.jpg")[0].shape == (64, 64, 3)
     data = (tmp_path / "a.jpg").read_bytes()
     last = data.rindex(b"\xff\xda")
-    (tmp_path / "b.jpg").write_bytes(data[:last] + data[last:-2] * 1000 + data[-2:])
-    many = (tmp_path / "b.jpg").read_bytes()
-    for name, filled in (
-        ("b", many),
-        ("c", many[:2] + b"\xff" + many[2:]),
-        ("d", many.replace(b"\xff\xda", b"\xff\xff\xda")),
-    ):
-        (tmp_path / f"{name}.jpg").write_bytes(filled)  # markers may follow fill bytes
+    many = data[:last] + data[last:-2] * 1000 + data[-2:]
+    for filled in (many, many[:2] + b"\xff" + many[2:], many.replace(b"\xff\xda", b"\xff\xff\xda")):
+        (tmp_path / "b.jpg").write_bytes(filled)  # markers may follow fill bytes
         with pytest.raises(InputError, match="scans"):
-            read_image(tmp_path / f"{name}.jpg")
+            read_image(tmp_path / "b.jpg")
 
 
 def glb(path, **document):
@@ -156,9 +144,6 @@ def glb(path, **document):
 
 def textured(size, **info):
     """The fields of a GLB whose material has one image of ``size``."""
-    import base64
-    import io
-
     data = io.BytesIO()
     Image.new("RGB", size).save(data, "PNG")
     uri = "data:image/png;base64," + base64.b64encode(data.getvalue()).decode()
@@ -208,13 +193,8 @@ def test_glb_fields(tmp_path, fields, word):
 @pytest.mark.parametrize(
     "change",
     [
-        {"shape": [1.0]},
-        {"shape": ["1"]},
-        {"shape": [True]},
-        {"data_offsets": [0.0, 4]},
-        {"data_offsets": ["0", "4"]},
-        {"data_offsets": [0, 1e400]},
-        {"data_offsets": [0]},
+        *({"shape": [value]} for value in (1.0, "1", True)),
+        *({"data_offsets": value} for value in ([0.0, 4], ["0", "4"], [0, 1e400], [0])),
     ],
 )
 def test_headers_of_weights_hold_integers(tmp_path, change):

@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from reli3d.geometry.camera import look_at
 from reli3d.io.glb import glb_bytes
 from reli3d.output import results
 from reli3d.output.folder import claimed
 from reli3d.render.asset import Asset
 from reli3d.render.lights import studio
-from reli3d.views.views import Views
+from tests.support.rigs import sphere_views
 from tests.support.scenes import ball_mesh, textures
 
-RECORD = {"output_from_input": [1], "model_from_input": [2], "weights": {"file": "x"}}
+RECORD = {"output_from_input": [1], "model_from_input": [2], "weights": {"file": "x"}}  # all of it in the mesh's extras
 PREVIEW = np.zeros((8, 8, 3), np.uint8)
 MOVED = (1.0, 2.0, 3.0)
 
@@ -29,8 +28,7 @@ def asset():
 
 @pytest.fixture
 def views():
-    c2w = look_at(torch.tensor([0.0, 0.0, 3.0]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))[None]
-    return Views((torch.ones(8, 8, 3),), (torch.ones(8, 8),), c2w, torch.tensor([[9.0, 9.0, 4.0, 4.0]]), ("a.png",))
+    return sphere_views(count=1, size=(8, 8))
 
 
 def written(folder, asset, views, **options):
@@ -43,10 +41,9 @@ def written(folder, asset, views, **options):
 def test_the_mesh_is_moved_and_the_page_shows_it_in_place(tmp_path, asset, views, threads, count):
     threads(count)
     written(tmp_path / "ball", asset, views, translation=MOVED)
-    extras = {k: RECORD[k] for k in ("output_from_input", "model_from_input", "weights")}
-    assert (tmp_path / "ball" / "mesh.glb").read_bytes() == glb_bytes(asset, extras=extras, translation=MOVED)
+    assert (tmp_path / "ball" / "mesh.glb").read_bytes() == glb_bytes(asset, extras=RECORD, translation=MOVED)
     (shown,) = re.findall(r'"glb": "([^"]*)"', (tmp_path / "ball" / "viewer.html").read_text())
-    assert base64.b64decode(shown) == glb_bytes(asset, extras=extras)
+    assert base64.b64decode(shown) == glb_bytes(asset, extras=RECORD)
     assert results.complete(tmp_path / "ball", tmp_path)
 
 
@@ -54,9 +51,8 @@ def test_the_page_of_a_refined_result_has_both(tmp_path, asset, views):
     start = replace(asset, mesh=ball_mesh(2, 0.6))
     written(tmp_path / "ball", asset, views, before=start)
     page = (tmp_path / "ball" / "viewer.html").read_text()
-    extras = {k: RECORD[k] for k in ("output_from_input", "model_from_input", "weights")}
     shown = dict(re.findall(r'"name": "(after|before)", "glb": "([^"]*)"', page))
-    assert base64.b64decode(shown["after"]) == glb_bytes(asset, extras=extras)
+    assert base64.b64decode(shown["after"]) == glb_bytes(asset, extras=RECORD)
     assert base64.b64decode(shown["before"]) == glb_bytes(start)
 
 

@@ -107,12 +107,8 @@ def test_two_folders_are_exchanged_and_a_missing_one_is_an_error(tmp_path):
 def test_long_names_and_names_that_are_not_utf8_take_a_result(tmp_path, name):
     folder = tmp_path / "out" / name
     assert check_place(folder) == Path(os.path.realpath(folder))
-    put(folder, "old")
-    with claimed(folder, OURS) as replacing, replacing() as new:
-        second = subprocess.run([sys.executable, "-c", WRITER, folder, "other", "0"], capture_output=True, text=True)
-        assert second.returncode == 1 and "got one at work" in second.stderr.splitlines()[-1]
-        for word in OURS:
-            (new / word).write_text("new")
+    for word in ("old", "new"):
+        put(folder, word)
     assert words(folder) == {"new"} and os.listdir(os.fsencode(tmp_path / "out")) == [os.fsencode(name)]
 
 
@@ -147,14 +143,13 @@ def test_a_link_to_a_folder_stays_one(tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="needs locks of files")
 def test_of_two_processes_one_reports_it_at_its_start(tmp_path):
     folder = tmp_path / "name"
-    with claimed(folder, OURS) as replacing:
+    with claimed(folder, OURS) as replacing, replacing() as new:
         began = time.monotonic()
         second = write(folder, "second", 0)
         assert second.returncode == 1 and "got one at work" in second.stderr.splitlines()[-1]
         assert time.monotonic() - began < 30  # it does not wait; a Python's start on a busy machine
-        with replacing() as new:
-            for name in OURS:
-                (new / name).write_text("first")
+        for name in OURS:
+            (new / name).write_text("first")
     assert words(folder) == {"first"} and [p.name for p in tmp_path.iterdir()] == ["name"]
 
 

@@ -78,83 +78,68 @@ def neus(folder, rig, **changes):
     np.savez(folder / "cameras_sphere.npz", **{**projections(whole, np.array([3.0, -40.0, 700.0]), 25.0), **changes})
 
 
-def test_neus(tmp_path, rig):
+@pytest.mark.parametrize("name", ["cameras_sphere.npz", "cameras.npz"])  # NeuS's and IDR's
+def test_neus(tmp_path, rig, name):
     neus(tmp_path, rig)
+    (tmp_path / "cameras_sphere.npz").rename(tmp_path / name)
     views = load_views(tmp_path)
     assert views.names == tuple(f"image/{j:06d}.png" for j in range(COUNT))
     np.testing.assert_allclose(views.c2w, rig.c2w, atol=2e-6)  # float32
     np.testing.assert_allclose(views.intrinsics, rig.intrinsics, rtol=1e-6, atol=1e-4)  # float32 principal point
     for ours, true in zip(views.masks, rig.masks):
         np.testing.assert_array_equal(ours, true)
-    assert any("cameras_sphere.npz" in note for note in views.notes)
+    assert any(name in note for note in views.notes)
     assert verdict(views).startswith("cameras agree")
 
 
-def test_idr_has_the_same_under_another_name(tmp_path, rig):
-    neus(tmp_path, rig)
-    (tmp_path / "cameras_sphere.npz").rename(tmp_path / "cameras.npz")
-    np.testing.assert_allclose(load_views(tmp_path).c2w, rig.c2w, atol=2e-6)
+def write(name, value, **options):
+    return lambda folder, rig: (llff(folder, rig), np.save(folder / name, value, **options))
 
 
-def pickled(folder):
-    np.save(folder / "poses_bounds.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-
-
-def write(name, value):
-    return lambda folder: np.save(folder / name, value)
-
-
-def claiming(folder):
+def claiming(folder, rig):
     """A header that claims 10^12 rows."""
+    llff(folder, rig)
     data = io.BytesIO()
     np.lib.format.write_array_header_1_0(data, {"descr": "<f8", "fortran_order": False, "shape": (10**12, 17)})
     (folder / "poses_bounds.npy").write_bytes(data.getvalue())
 
 
-BROKEN_LLFF = {
-    "pickle": pickled,
-    "shape": write("poses_bounds.npy", np.ones((COUNT, 15))),
-    "not finite": write("poses_bounds.npy", np.full((COUNT, 17), np.nan)),
-    "fewer than images": write("poses_bounds.npy", np.ones((COUNT - 1, 17))),
-    "zero": write("poses_bounds.npy", np.zeros((COUNT, 17))),
-    "no rotation": write("poses_bounds.npy", np.ones((COUNT, 17))),
-    "text": lambda folder: (folder / "poses_bounds.npy").write_bytes(b"1 2 3"),
-    "cut off": lambda folder: (folder / "poses_bounds.npy").write_bytes(
-        (folder / "poses_bounds.npy").read_bytes()[:99]
-    ),
-    "claims more": claiming,
-}
+def shortened(folder, rig):
+    llff(folder, rig)
+    (folder / "poses_bounds.npy").write_bytes((folder / "poses_bounds.npy").read_bytes()[:99])
 
 
-@pytest.mark.parametrize("name", BROKEN_LLFF)
-def test_a_broken_poses_bounds_is_refused(tmp_path, rig, name):
-    llff(tmp_path, rig)
-    BROKEN_LLFF[name](tmp_path)
-    with pytest.raises(InputError, match="poses_bounds.npy: .*; "):
-        load_views(tmp_path)
-
-
-def bomb(folder):
+def bomb(folder, rig):
+    neus(folder, rig)
     with zipfile.ZipFile(folder / "cameras_sphere.npz", "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("world_mat_0.npy", bytes(1 << 27))
 
 
-BROKEN_NEUS = {
-    "singular": lambda folder, rig: neus(folder, rig, world_mat_2=np.zeros((4, 4))),
-    "shape": lambda folder, rig: neus(folder, rig, scale_mat_1=np.eye(3)),
-    "not finite": lambda folder, rig: neus(folder, rig, world_mat_1=np.full((4, 4), np.inf)),
-    "skew": lambda folder, rig: neus(folder, rig, world_mat_0=np.eye(4) + 0.2 * np.eye(4, k=1)),
-    "pickle": lambda folder, rig: neus(folder, rig, world_mat_0=np.array([{}], dtype=object)),
-    "no scale": lambda folder, rig: (neus(folder, rig), np.savez(folder / "cameras_sphere.npz", world_mat_0=np.eye(4))),
-    "more images": lambda folder, rig: (neus(folder, rig), Image.new("RGB", (9, 9)).save(folder / "image/9.png")),
-    "bomb": lambda folder, rig: (neus(folder, rig), bomb(folder)),
-}  # fmt: skip
+BROKEN = {
+    "llff, pickle": write("poses_bounds.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True),
+    "llff, shape": write("poses_bounds.npy", np.ones((COUNT, 15))),
+    "llff, not finite": write("poses_bounds.npy", np.full((COUNT, 17), np.nan)),
+    "llff, fewer than images": write("poses_bounds.npy", np.ones((COUNT - 1, 17))),
+    "llff, zero": write("poses_bounds.npy", np.zeros((COUNT, 17))),
+    "llff, no rotation": write("poses_bounds.npy", np.ones((COUNT, 17))),
+    "llff, text": lambda folder, rig: (llff(folder, rig), (folder / "poses_bounds.npy").write_bytes(b"1 2 3")),
+    "llff, cut off": shortened,
+    "llff, claims more": claiming,
+    "neus, singular": lambda folder, rig: neus(folder, rig, world_mat_2=np.zeros((4, 4))),
+    "neus, shape": lambda folder, rig: neus(folder, rig, scale_mat_1=np.eye(3)),
+    "neus, not finite": lambda folder, rig: neus(folder, rig, world_mat_1=np.full((4, 4), np.inf)),
+    "neus, skew": lambda folder, rig: neus(folder, rig, world_mat_0=np.eye(4) + 0.2 * np.eye(4, k=1)),
+    "neus, pickle": lambda folder, rig: neus(folder, rig, world_mat_0=np.array([{}], dtype=object)),
+    "neus, no scale": lambda f, rig: (neus(f, rig), np.savez(f / "cameras_sphere.npz", world_mat_0=np.eye(4))),
+    "neus, more images": lambda f, rig: (neus(f, rig), Image.new("RGB", (9, 9)).save(f / "image/9.png")),
+    "neus, bomb": bomb,
+}
 
 
-@pytest.mark.parametrize("name", BROKEN_NEUS)
-def test_a_broken_cameras_sphere_is_refused(tmp_path, rig, name):
-    BROKEN_NEUS[name](tmp_path, rig)
-    with pytest.raises(InputError, match="cameras_sphere.npz: .*; "):
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_file_is_refused(tmp_path, rig, name):
+    BROKEN[name](tmp_path, rig)
+    with pytest.raises(InputError, match=r"(poses_bounds.npy|cameras_sphere.npz): .*; "):
         load_views(tmp_path)
 
 

@@ -122,7 +122,7 @@ def test_views_that_cut_the_object_off_are_left_out_while_eight_remain(tmp_path)
 
 
 def test_of_many_views_that_all_cut_the_object_off_none_is_left_out(tmp_path):
-    cut_off(tmp_path, 40, range(40))
+    cut_off(tmp_path, 18, range(18))
     views = load_views(tmp_path)
     assert len(views) == 16 and views.names[0] == "rgba/00.png"
     assert any(n.endswith("; used all the same") for n in views.notes)

@@ -53,25 +53,21 @@ def test_object_folder_as_published(tmp_path):
 
 def test_blender_folder(tmp_path):
     photo(tmp_path / "train/r_0.png")
-    transforms(
-        tmp_path,
-        [{"file_path": "./train/r_0", "rotation": 0.1, "transform_matrix": hostile.pose(0.3)}],
-        camera_angle_x=0.6911112070083618,
-    )
+    angle, frame = 0.6911112070083618, {"file_path": "./train/r_0", "rotation": 0.1}
+    transforms(tmp_path, [frame | {"transform_matrix": hostile.pose(0.3)}], camera_angle_x=angle)
     views = load_views(tmp_path)
-    focal = 0.5 * 40 / math.tan(0.5 * 0.6911112070083618)  # the focal length of x serves y: square pixels
+    focal = 0.5 * 40 / math.tan(0.5 * angle)  # the focal length of x serves y: square pixels
     torch.testing.assert_close(views.intrinsics, torch.tensor([[focal, focal, 20.0, 15.0]]))
     assert views.images[0].shape == (30, 40, 3)
     assert float(views.images[0][0, 0, 0]) == pytest.approx(90 / 255)  # the color under alpha 0
 
 
 def test_nerfstudio_folder(tmp_path):
-    photo(tmp_path / "images/a.jpg", alpha=False)
-    photo(tmp_path / "images/b.jpg", alpha=False)
+    mask = np.zeros((30, 40), np.uint8)
+    mask[4:20, 6:30] = 255
+    (tmp_path / "masks").mkdir()
     for name in "ab":
-        mask = np.zeros((30, 40), np.uint8)
-        mask[4:20, 6:30] = 255
-        (tmp_path / "masks").mkdir(exist_ok=True)
+        photo(tmp_path / f"images/{name}.jpg", alpha=False)
         Image.fromarray(mask).save(tmp_path / f"masks/{name}.png")
     own = {"fl_x": 70.0, "w": 40, "h": 30, "cx": 19.0, "cy": 14.0}
     frames = [
@@ -84,10 +80,8 @@ def test_nerfstudio_folder(tmp_path):
     views = load_views(tmp_path)
     # the first is calibrated at twice the size; the second has its own focal length, which serves both sides
     torch.testing.assert_close(views.intrinsics, torch.tensor([[60.0, 60.5, 20.5, 14.5], [70.0, 70.0, 19.0, 14.0]]))
-    notes = " ".join(views.notes)
-    assert "scaled from 80 x 60 to 40 x 30" in notes
-    assert "applied_transform" in notes
-    assert "distortion" in notes
+    for text in ("scaled from 80 x 60 to 40 x 30", "applied_transform", "distortion"):
+        assert text in " ".join(views.notes)
     assert [int(m.sum()) for m in views.masks] == [384, 384]
 
 
@@ -122,14 +116,10 @@ def test_colmap_folder_agrees_with_colmaps_own_projection(tmp_path):
         load_views(tmp_path, masks=tmp_path / "none")
 
 
-def test_small_distortion_is_ignored_with_a_note_and_large_refused(tmp_path):
+def test_the_distortion_of_a_colmap_camera(tmp_path):
     hostile.colmap(tmp_path)
-    cameras = tmp_path / "sparse/0/cameras.txt"
-    cameras.write_text("1 RADIAL 32 32 51.7 16 16 0.001 0\n")
+    (tmp_path / "sparse/0/cameras.txt").write_text("1 RADIAL 32 32 51.7 16 16 0.001 0\n")
     assert any("distortion" in n for n in load_views(tmp_path).notes)
-    cameras.write_text("1 RADIAL 32 32 51.7 16 16 -0.5 0\n")
-    with pytest.raises(InputError, match="undistort"):
-        load_views(tmp_path)
     # k1 moves the corner at radius r (over the focal length) by f k1 r^3
     assert distortion_pixels(100, (60.0, 80.0), (0.1, 0.0), ()) == pytest.approx(100 * 0.1 * 1.0**3)
 
@@ -137,25 +127,25 @@ def test_small_distortion_is_ignored_with_a_note_and_large_refused(tmp_path):
 def test_which_mask_counts(tmp_path):
     """A masks argument, then mask_path, then alpha, then a masks folder."""
     photo(tmp_path / "a.png")
-    shapes = {}
-    for k, name in enumerate(("given", "named", "masks")):
+    for rows, name in ((10, "given"), (11, "named"), (12, "masks")):
         mask = np.zeros((30, 40), np.uint8)
-        mask[: 10 + k] = 255
-        shapes[name] = int(mask.sum() / 255)
+        mask[:rows] = 255
         (tmp_path / name).mkdir()
         Image.fromarray(mask).save(tmp_path / name / "a.png")
     frame = {"file_path": "a.png", "transform_matrix": hostile.pose(0), "camera_fov": 0.6}
+
+    def area(**options):
+        return int(load_views(tmp_path, **options).masks[0].sum())
+
     transforms(tmp_path, [frame])
-    alpha = 20 * 24
-    assert int(load_views(tmp_path).masks[0].sum()) == alpha
-    assert int(load_views(tmp_path, masks=tmp_path / "given").masks[0].sum()) == shapes["given"]
+    assert area() == 20 * 24 and area(masks=tmp_path / "given") == 10 * 40  # alpha's, and the given
     transforms(tmp_path, [frame | {"mask_path": "named/a.png"}])
-    assert int(load_views(tmp_path).masks[0].sum()) == shapes["named"]
+    assert area() == 11 * 40
     transforms(tmp_path, [frame])
     photo(tmp_path / "a.png", alpha=False)
-    assert int(load_views(tmp_path).masks[0].sum()) == shapes["masks"]
+    assert area() == 12 * 40
     (tmp_path / "masks/a.png").rename(tmp_path / "masks/a.png.png")  # as COLMAP names them
-    assert int(load_views(tmp_path).masks[0].sum()) == shapes["masks"]
+    assert area() == 12 * 40
 
 
 def test_files_outside_are_refused(tmp_path):
@@ -164,7 +154,6 @@ def test_files_outside_are_refused(tmp_path):
     transforms(tmp_path / "object", [frame])
     with pytest.raises(InputError, match="leads out of it"):
         load_views(tmp_path / "object")
-    transforms(tmp_path / "object", [frame | {"file_path": str(tmp_path / "elsewhere/a.png")}])
     transforms(tmp_path / "object", [frame | {"file_path": "../object/../object/b"}])  # inside again: accepted
     photo(tmp_path / "object/b.png")
     assert len(load_views(tmp_path / "object")) == 1
@@ -202,11 +191,17 @@ def test_rounding_in_the_matrix_is_cleaned_up(tmp_path):
     assert float((rotation - exact).abs().max()) < 1e-4  # four digits
 
 
-def test_paths_with_spaces_and_other_letters(tmp_path):
+def test_names_of_files(tmp_path):
+    """Spaces and other letters, accents in either composition; resource files of macOS are no images."""
     folder = tmp_path / "mein Objekt ñ"
     photo(folder / "im ages/é 1.png")
     transforms(folder, [{"file_path": "im ages/é 1.png", "transform_matrix": hostile.pose(0), "camera_fov": 0.6}])
     assert load_views(str(folder)).names == ("im ages/é 1.png",)
+    composed, decomposed = "St\u00fcck.png", "Stu\u0308ck.png"
+    for name in (decomposed, "._a.png"):
+        (tmp_path / name).write_bytes(b"")
+    assert FolderIndex().find(tmp_path, PurePath(composed)) == tmp_path / decomposed
+    assert images_in(tmp_path) == [tmp_path / decomposed] and tmp_path / "._a.png" not in images_below(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["Camera_01", "Lantern_01", "UCO3D_217-72983-41010", "UCO3D_639-13622-90739"])
@@ -247,15 +242,3 @@ def test_the_lighting_of_a_capture_is_read(tmp_path):
     transforms(tmp_path, frames, lighting="turntable")
     with pytest.raises(InputError, match="lighting: expected object or camera"):
         load_views(tmp_path)
-
-
-def test_accents_in_either_composition_name_one_file(tmp_path):
-    composed, decomposed = "St\u00fcck.png", "Stu\u0308ck.png"
-    (tmp_path / decomposed).write_bytes(b"")
-    assert FolderIndex().find(tmp_path, PurePath(composed)) == tmp_path / decomposed
-
-
-def test_resource_files_of_macos_are_no_images(tmp_path):
-    for name in ("a.png", "._a.png"):
-        (tmp_path / name).write_bytes(b"")
-    assert images_in(tmp_path) == images_below(tmp_path) == [tmp_path / "a.png"]

@@ -7,7 +7,6 @@ import torch
 from reli3d.views.folder import load_views
 from reli3d.views.normalize import meeting_point, normalize, visual_hull
 from reli3d.views.similarity import Similarity
-from reli3d.views.views import Views
 from tests.support.rigs import eyes_around, sphere_views
 
 BALL = ((0.0, 0.0, 0.0, 0.5),)
@@ -18,13 +17,12 @@ def turn(seed: int) -> torch.Tensor:
     return q * torch.sign(torch.linalg.det(q))
 
 
-def some_similarity(seed: int) -> Similarity:
-    shift = torch.randn(3, generator=torch.Generator().manual_seed(seed + 9), dtype=torch.float64)
-    return Similarity(0.3 + seed, turn(seed), shift)
-
-
 def some_turn(seed: int, scale: float) -> Similarity:
     return Similarity(scale, turn(seed), torch.tensor([5.0, -9.0, 2.0], dtype=torch.float64))
+
+
+def unturned(scale: float, *shift: float) -> Similarity:
+    return Similarity.without_rotation(torch.tensor(shift, dtype=torch.float64), scale)
 
 
 ROD = tuple((0.0, 0.05 * k, 0.0, 0.1) for k in range(-8, 9))  # 1.0 long, 0.2 thick
@@ -38,7 +36,7 @@ def one_sided(spheres):
     return sphere_views(spheres, eyes=eyes, fov=0.6, size=(160, 160))
 
 
-@pytest.mark.parametrize("k", range(4))
+@pytest.mark.parametrize("k", range(2))
 def test_the_scale_of_a_one_sided_capture_does_not_depend_on_the_frame(k):
     """A rod across the views is 1 long; one along them is as deep as its silhouettes leave open, or 1.3 widths."""
     across, along = one_sided(ROD), one_sided(tuple((x, z, y, r) for x, y, z, r in ROD))
@@ -53,10 +51,10 @@ def test_the_scale_of_a_one_sided_capture_does_not_depend_on_the_frame(k):
 
 
 def test_similarities_are_a_group():
-    a, b = some_similarity(1), some_similarity(2)
+    a, b = some_turn(1, 1.3), some_turn(2, 2.3)
     points = torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
     homogeneous = torch.cat([points, torch.ones(20, 1)], -1)
-    exact = dict(rtol=0, atol=1e-12)  # float64, a few operations on values below 10
+    exact = dict(rtol=0, atol=1e-12)  # float64, a few operations on values below 50
     torch.testing.assert_close(a.apply(points), (homogeneous @ a.matrix().T)[:, :3], **exact)
     torch.testing.assert_close(a.compose(b).matrix(), a.matrix() @ b.matrix(), **exact)
     torch.testing.assert_close(a.compose(b).apply(points), a.apply(b.apply(points)), **exact)
@@ -83,24 +81,16 @@ def test_the_hull_of_many_views_is_the_object(spheres, low, high):
     assert limit < 0.1
 
 
+FAR, NEAR = (300, -20, 5), (0.02, 0.1, 0)
+
+
 @pytest.mark.parametrize(
-    "count, scale, center",
-    [
-        (1, 1.0, (0, 0, 0)),
-        (1, 40.0, (0, 0, 0)),
-        (2, 1.0, (0, 0, 0)),
-        (2, 40.0, (300, -20, 5)),
-        (3, 0.01, (0.02, 0.1, 0)),
-        (8, 40.0, (300, -20, 5)),
-        (8, 0.01, (0.02, 0.1, 0)),
-    ],
+    "count, scale, center", [(1, 40.0, (0, 0, 0)), (2, 40.0, FAR), (3, 0.01, NEAR), (8, 40.0, FAR)]
 )
 def test_an_object_anywhere_is_centered_and_scaled(count, scale, center):
     """A ball of diameter 1.  One view finds its middle if it is the point of the ray nearest to the origin."""
-    center = torch.tensor(center, dtype=torch.float64)
-    views = sphere_views(BALL, count).transformed(Similarity(scale, torch.eye(3, dtype=torch.float64), center))
-    similarity = normalize(views, "hull")
-    middle = similarity.apply(center)
+    similarity = normalize(sphere_views(BALL, count).transformed(unturned(scale, *center)), "hull")
+    middle = similarity.apply(torch.tensor(center, dtype=torch.float64))
     radius = similarity.scale * 0.5 * scale
     # the hull of a few views of a ball exceeds it by up to 30 % (the limiting ball), mostly by its grid
     assert 0.5 / 1.35 < radius < 0.53
@@ -111,7 +101,7 @@ def test_an_object_anywhere_is_centered_and_scaled(count, scale, center):
 def test_normalization_does_not_depend_on_the_frame():
     """Scaling and shifting the rig changes the answer by that much and nothing else."""
     views = sphere_views(count=5)
-    move = Similarity(7.0, torch.eye(3, dtype=torch.float64), torch.tensor([3.0, 1.0, -2.0], dtype=torch.float64))
+    move = unturned(7.0, 3.0, 1.0, -2.0)
     there = normalize(views.transformed(move), "hull").compose(move)
     # c2w is float32: the grid shifts by 1e-6 and a cell at the edge may change sides
     torch.testing.assert_close(there.matrix(), normalize(views, "hull").matrix(), rtol=0, atol=0.04)
@@ -121,7 +111,7 @@ def test_auto_leaves_a_good_frame_alone_and_changes_a_bad_one():
     assert normalize(sphere_views(BALL, 4)).is_identity()
     assert normalize(sphere_views(BALL, 1)).is_identity()
     for scale, shift in ((0.3, 0.0), (0.6, 0.0), (1.4, 0.0), (2.5, 0.0), (1.0, 0.2), (1.0, 0.5)):
-        move = Similarity(scale, torch.eye(3, dtype=torch.float64), torch.tensor([shift, 0, 0], dtype=torch.float64))
+        move = unturned(scale, shift, 0.0, 0.0)
         moved = sphere_views(BALL, 4).transformed(move)
         similarity = normalize(moved)
         assert not similarity.is_identity()
@@ -171,8 +161,7 @@ def test_rays_meet():
 
 def test_cameras_that_agree_on_nothing_are_an_error():
     views = sphere_views(count=3)
-    flipped = views.c2w @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-    wrong = Views(views.images, views.masks, flipped, views.intrinsics, views.names)
+    wrong = replace(views, c2w=views.c2w @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
     with pytest.raises(ValueError, match="reli3d check"):
         normalize(wrong)
     assert normalize(wrong, "none").is_identity()
@@ -190,7 +179,7 @@ def test_real_captures_are_left_alone_until_they_are_moved(shared_data, name):
     scales = [12.0 * normalize(views.transformed(some_turn(k, 12.0)), "hull").scale for k in range(4)]
     if name.startswith("UCO3D"):  # one-sided: the frame changes nothing but where the grid's cells lie, 3 % of a side
         np.testing.assert_allclose(scales, normalize(views, "hull").scale, rtol=0.06)
-    move = Similarity(12.0, turn(3), torch.tensor([5.0, -9.0, 2.0], dtype=torch.float64))
+    move = some_turn(3, 12.0)
     similarity = normalize(views.transformed(move))
     size = 12.0 * similarity.scale  # of the capture in the network's frame; its longest side was 0.87 to 1.07
     assert 0.7 < size < 1.5  # the box of a turned object is another box, up to sqrt(2) smaller for a rod

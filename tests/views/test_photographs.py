@@ -99,9 +99,9 @@ def test_exif_orientation_counts_where_the_cameras_were_calibrated_on_turned_ima
 
 
 def test_a_large_mask_of_isolated_pixels_is_empty(tmp_path):
-    folder = capture(tmp_path / "large", 6000, 4000, (1500, 800, 4500, 3200))
-    specks = np.zeros((4000, 6000), np.uint8)
-    specks[200:3800:200, 300:5700:300] = 255
+    folder = capture(tmp_path / "large", 3000, 2000, (750, 400, 2250, 1600))
+    specks = np.zeros((2000, 3000), np.uint8)
+    specks[100:1900:100, 150:2850:150] = 255
     Image.fromarray(specks).save(folder / "masks/a.png")
     with pytest.raises(InputError, match="mask that is empty"):
         load_views(folder)
@@ -150,14 +150,10 @@ def test_16_large_photographs_take_less_than_a_gibibyte(tmp_path):
     assert float(gibibytes) < 1.0
 
 
-def plain(folder, masks=True, inner="images"):
-    (folder / inner).mkdir(parents=True, exist_ok=True)
+def plain(folder):
+    folder.mkdir(parents=True)
     for i in range(3):
-        Image.fromarray(hostile.random_image(alpha=False)).save(folder / inner / f"p {i}.jpg")
-    if masks:
-        (folder / "masks").mkdir()
-        for i in range(3):
-            Image.fromarray(hostile.random_image()[..., 3]).save(folder / f"masks/p {i}.png")
+        Image.fromarray(hostile.random_image(alpha=False)).save(folder / f"p {i}.jpg")
     return folder
 
 
@@ -169,13 +165,13 @@ def command(source):
 
 def test_photographs_without_cameras_are_answered_with_the_command(tmp_path, monkeypatch):
     """In one line, with quoted names: photographs in a folder or its ``images``, a video, the parent of an album."""
-    shoe = plain(tmp_path / "my shoe")
+    shoe = plain(tmp_path / "my shoe/images").parent
     line = f"got 3 photographs without; run: reli3d capture '{shoe}/images' '{shoe}-object'"
     assert line in command(shoe)
-    flat = plain(tmp_path / "flat", masks=False, inner=".")
+    flat = plain(tmp_path / "flat")
     assert f"reli3d capture {flat} {flat}-object" in command(flat)
     parent = tmp_path / "DCIM"
-    album = plain(parent / "100APPLE", masks=False, inner=".")
+    album = plain(parent / "100APPLE")
     assert f"got 3 photographs in 100APPLE without; run: reli3d capture {album} {album}-object" in command(parent)
     video = tmp_path / "turn.MOV"
     video.write_bytes(b"video")
@@ -193,22 +189,17 @@ def test_photographs_without_cameras_are_answered_with_the_command(tmp_path, mon
     monkeypatch.chdir(flat)
     assert "run: reli3d capture . ../flat-object" in command(".")
     capture(tmp_path / "objects/one", 400, 300, (100, 50, 300, 250))
-    assert f"expected one object, got 1 folders of objects; give {tmp_path}/objects/one" in command(
-        tmp_path / "objects"
-    )
+    line = f"expected one object, got 1 folders of objects; give {tmp_path}/objects/one"
+    assert line in command(tmp_path / "objects")
     (tmp_path / "empty").mkdir()
     assert "expected transforms.json or a COLMAP model" in command(tmp_path / "empty")
-
-
-def without_masks(folder):
-    capture(folder, 400, 300, (100, 50, 300, 250))
-    for path in (folder / "masks").iterdir():
-        path.unlink()
-    return folder
+    (tmp_path / "empty/IMG_1.DNG").write_bytes(b"photograph")
+    assert "IMG_1.DNG: expected JPEG, HEIC or PNG photographs; convert" in command(tmp_path / "empty")
 
 
 def test_backgrounds_are_removed_on_request_alone(tmp_path, monkeypatch):
-    folder = without_masks(tmp_path / "object")
+    folder = capture(tmp_path / "object", 400, 300, (100, 50, 300, 250))
+    (folder / "masks/a.png").unlink()
     with pytest.raises(InputError, match="expected alpha or a foreground mask.*--remove-background"):
         load_views(folder)
     requested = []
@@ -231,8 +222,3 @@ def test_backgrounds_are_removed_on_request_alone(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rembg", None)  # as if it were not installed
     with pytest.raises(InputError, match=r"^remove-background: expected rembg installed.*reli3d\[masks\]"):
         load_views(folder, remove_background=True)
-
-
-def test_camera_raw_is_refused(tmp_path):
-    (tmp_path / "IMG_1.DNG").write_bytes(b"photograph")
-    assert "IMG_1.DNG: expected JPEG, HEIC or PNG photographs; convert" in command(tmp_path)

@@ -1,5 +1,6 @@
 """The published network's inputs against the release's own tensors, and the options of the user."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,29 +10,19 @@ from safetensors.numpy import load_file
 
 from reli3d.views import published_views as module
 from reli3d.views.folder import load_views
-from reli3d.views.published_views import (
-    background_shown,
-    hero_first,
-    jpeg_round_trip,
-    placement_notes,
-    published_views,
-)
+from reli3d.views.published_views import background_shown, hero_first, jpeg_round_trip, placement_notes, published_views
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import Views
+from tests.support.rigs import sphere_views
 
 # bilinear weights and the division by 255 in float32, summed in another order: 2 units in the last place of 1
 ROUNDING = 2.5e-7
 
 
-def small_views(count: int = 3, height: int = 20, width: int = 30) -> Views:
-    generator = torch.Generator().manual_seed(4)
-    images = tuple(torch.rand(height, width, 3, generator=generator) for _ in range(count))
-    mask = torch.zeros(height, width)
-    mask[5:15, 8:22] = 1.0
-    c2w = torch.eye(4).repeat(count, 1, 1)
-    c2w[:, 2, 3] = torch.arange(2.0, 2.0 + count)
-    intrinsics = torch.tensor([[40.0, 50.0, 14.0, 11.0]]).repeat(count, 1)
-    return Views(images, (mask,) * count, c2w, intrinsics, tuple("abcdefgh"[:count]))
+def small_views(count: int = 3) -> Views:
+    rng = torch.Generator().manual_seed(4)
+    images = tuple(torch.rand(20, 30, 3, generator=rng) for _ in range(count))
+    return replace(sphere_views(count=count, size=(30, 20)), images=images)
 
 
 def test_a_render_is_prepared_as_published(goldens, shared_data):
@@ -80,8 +71,7 @@ def test_shapes_cameras_and_errors():
     views = small_views()
     batch = published_views(views, 16)
     assert batch.images.shape == (3, 16, 16, 3) and set(batch.masks.unique().tolist()) == {0.0, 1.0}
-    x, y = 16 / 30, 16 / 20
-    torch.testing.assert_close(batch.intrinsics[0], torch.tensor([40 * x, 50 * y, 14 * x, 11 * y]))
+    torch.testing.assert_close(batch.intrinsics, views.intrinsics * torch.tensor([16 / 30, 16 / 20] * 2))
     with pytest.raises(ValueError, match="size: expected at least 1"):
         published_views(views, 0)
 
@@ -89,7 +79,7 @@ def test_shapes_cameras_and_errors():
 def test_the_hero_comes_first_and_the_rest_keeps_its_order():
     views = small_views(4)
     assert hero_first(views, 0) is views
-    assert hero_first(views, 2).names == ("c", "a", "b", "d")
+    assert hero_first(views, 2).names == ("2.png", "0.png", "1.png", "3.png")
     for wrong in (4, -1, True, "last"):
         with pytest.raises(ValueError, match="hero: expected 0 to 3 with 4 views"):
             hero_first(views, wrong)
@@ -98,7 +88,7 @@ def test_the_hero_comes_first_and_the_rest_keeps_its_order():
 def test_the_background_is_shown_where_there_is_one():
     views = small_views(2)
     flat = torch.where(views.masks[0][..., None] > 0, views.images[0], torch.tensor(0.25))
-    cut = Views((views.images[0], flat), views.masks, views.c2w, views.intrinsics, views.names)
+    cut = replace(views, images=(views.images[0], flat))
     assert background_shown(views, "auto", readable=True)
     assert not background_shown(views, "auto", readable=False)
     assert not background_shown(cut, "auto", readable=True)  # one view without is enough

@@ -60,18 +60,19 @@ def test_a_crop_over_the_border_has_no_mask_and_the_edge_color():
     assert float(row[30]) > 0.02
 
 
-def test_small_pixels_do_not_alias():
-    checker = (torch.arange(128)[:, None] + torch.arange(128)) % 2
-    views = Views(
-        (checker[..., None].expand(-1, -1, 3).float(),),
-        (torch.ones(128, 128),),
-        torch.eye(4)[None],
-        torch.ones(1, 4),
-        ("c",),
-    )
-    image = views.resampled(16, crop=False).images[0]
+def board(count: int) -> Views:
+    """A checkerboard of single pixels."""
+    checker = (torch.arange(count)[:, None] + torch.arange(count)) % 2
+    image = checker[..., None].expand(-1, -1, 3).float()
+    return Views((image,), (torch.ones(count, count),), torch.eye(4)[None], torch.ones(1, 4), ("c",))
+
+
+def test_small_pixels_do_not_alias_and_linear_averages_are_those_of_light():
+    image = board(128).resampled(16, crop=False).images[0]
     # a triangle filter over 16 pixels leaves 1/64 of a checkerboard; the border, where it is cut, a little more
     assert float((image - 0.5).abs().max()) < 0.02
+    mean = board(64).resampled(8, crop=False, linear=True).images
+    torch.testing.assert_close(srgb_to_linear(mean)[:, 2:-2, 2:-2], torch.full((1, 4, 4, 3), 0.5), rtol=0, atol=0.02)
 
 
 def test_the_mask_keeps_its_area():
@@ -111,21 +112,21 @@ def test_selection():
 
 def test_views_are_checked():
     v = sphere_views(count=2)
-    with pytest.raises(ValueError, match="c2w: expected shape"):
-        Views(v.images, v.masks, v.c2w[:1], v.intrinsics, v.names)
-    with pytest.raises(ValueError, match="masks, names"):
-        Views(v.images, v.masks[:1], v.c2w, v.intrinsics, v.names)
-    with pytest.raises(ValueError, match=r"masks\[1\]"):
-        Views(v.images, (v.masks[0], v.masks[1][:-1]), v.c2w, v.intrinsics, v.names)
-    with pytest.raises(TypeError, match=r"images\[0\]"):
-        Views((v.images[0].double(), v.images[1]), v.masks, v.c2w, v.intrinsics, v.names)
-    with pytest.raises(ValueError, match="at least one view"):
-        Views((), (), v.c2w[:0], v.intrinsics[:0], ())
+    for error, words, change in (
+        (ValueError, "c2w: expected shape", {"c2w": v.c2w[:1]}),
+        (ValueError, "intrinsics: expected shape", {"intrinsics": v.intrinsics[:1]}),
+        (ValueError, "masks, names", {"masks": v.masks[:1]}),
+        (ValueError, r"masks\[1\]", {"masks": (v.masks[0], v.masks[1][:-1])}),
+        (ValueError, r"images\[0\]: expected shape", {"images": (v.images[0][:0], v.images[1])}),
+        (TypeError, r"images\[0\]", {"images": (v.images[0].double(), v.images[1])}),
+        (ValueError, "at least one view", {"images": ()}),
+    ):
+        with pytest.raises(error, match=words):
+            replace(v, **change)
     with pytest.raises(ValueError, match="size"):
         v.resampled(0)
-    empty = Views(v.images, (v.masks[0] * MASK_EDGE, v.masks[1]), v.c2w, v.intrinsics, v.names)
     with pytest.raises(ValueError, match="empty mask"):
-        empty.resampled(32)
+        replace(v, masks=(v.masks[0] * MASK_EDGE, v.masks[1])).resampled(32)
 
 
 def test_cut_off_views_are_left_out_of_a_refinement_while_three_remain(monkeypatch):
@@ -152,14 +153,6 @@ def test_wrong_arguments_of_a_refinement_are_refused_before_images_are_resampled
         refine(asset, small_scene.input_views(asset, 3, 16), steps=1)
     with pytest.raises(ValueError, match="seconds, steps: expected one of the two"):
         refine(asset, views)
-
-
-def test_linear_averages_are_those_of_light():
-    checkers = (torch.arange(64)[:, None] + torch.arange(64)) % 2
-    image = checkers[..., None].expand(-1, -1, 3).float()
-    views = Views((image,), (torch.ones(64, 64),), torch.eye(4)[None], torch.tensor([[64.0, 64, 32, 32]]), ("a",))
-    mean = views.resampled(8, crop=False, linear=True).images
-    torch.testing.assert_close(srgb_to_linear(mean)[:, 2:-2, 2:-2], torch.full((1, 4, 4, 3), 0.5), rtol=0, atol=0.02)
 
 
 def test_the_silhouette_of_a_cut_off_object_continues_beyond_the_image():
