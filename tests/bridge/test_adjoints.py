@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from reli3d.geometry.hits import interpolate
-from reli3d.geometry.mesh import Mesh, face_normals, vertex_normals
+from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.regularize import vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import CubeWeights, extract_surface
@@ -288,16 +288,6 @@ def normals(g) -> Op:
     return Op({"vertices": mesh.vertices}, lambda v: vertex_normals(v, mesh.faces.to(v.device)), in_float64)
 
 
-def flat_normals(g) -> Op:
-    mesh = sheet(150)[0]
-
-    def in_float64(vertices):
-        a, b, c = (vertices[mesh.faces[:, k].long()] for k in range(3))
-        return torch.linalg.cross(b - a, c - a)
-
-    return Op({"vertices": mesh.vertices}, lambda v: face_normals(v, mesh.faces.to(v.device)), in_float64)
-
-
 def smoothing(g) -> Op:
     mesh = sheet(size := 150)[0]
     n = len(mesh.vertices)
@@ -318,23 +308,9 @@ def smoothing(g) -> Op:
     return Op({"vertices": mesh.vertices}, ours, in_float64)
 
 
+PLAIN = (triplane, flexicubes, centers, deviation, texture, normals, smoothing, density, irradiance, gaussians)
 OPS = {
-    **{
-        f.__name__: f
-        for f in (
-            triplane,
-            flexicubes,
-            centers,
-            deviation,
-            texture,
-            normals,
-            flat_normals,
-            smoothing,
-            density,
-            irradiance,
-            gaussians,
-        )
-    },
+    **{f.__name__: f for f in PLAIN},
     **{f"attributes {n}": partial(attributes, channels=n) for n in (2, 3, 4)},
     **{f"points {name}": partial(points_of_a_mesh, tangents=name == "tangents") for name in ("tangents", "uv")},
     **{f"reflections {lobe}": partial(reflections, lobe=lobe) for lobe in ("visible", "mirrored")},

@@ -41,18 +41,23 @@ def test_half_plane_is_exact_for_an_unsaturated_ramp(device):
     torch.testing.assert_close(got[near], true[near], rtol=0, atol=2e-5)  # float32 of coordinates up to 50
 
 
-def test_disc_is_sub_pixel(device):
-    mask, true = disk(128, (63.3, 66.8), 37.2)
+@pytest.mark.parametrize(
+    "size, center, radius, hard, most",
+    [
+        # a coverage that saturates one pixel from the contour moves the linear crossing by at most 0.09 pixels
+        (128, (63.3, 66.8), 37.2, False, 0.1),
+        # beyond 16 pixels the ends of segments will do: 0.25 / 16 too far at most
+        (256, (127.3, 130.8), 60.2, False, 0.1 + 0.25 / 16),
+        # the staircase's corners stand half a pixel diagonal off at most
+        (128, (63.3, 66.8), 37.2, True, 0.75),
+    ],
+)
+def test_distance_to_a_disc(device, size, center, radius, hard, most):
+    mask, true = disk(size, center, radius)
+    mask = (true > 0).float() if hard else mask
     got = mask_distance(mask[None].to(device))[0].cpu()
-    # a coverage that saturates one pixel from the contour moves the linear crossing by at most 0.09 pixels
-    assert (got - true).abs().max() < 0.1
+    assert (got - true).abs().max() < most
     assert bool(((got > 0) == (mask >= 0.5)).all())
-
-
-def test_hard_mask_is_within_half_a_pixel():
-    _, true = disk(128, (63.3, 66.8), 37.2)
-    got = mask_distance((true > 0).float()[None])[0]
-    assert (got - true).abs().max() < 0.75  # the staircase's corners stand half a pixel diagonal off at most
 
 
 def test_two_blobs_and_a_hole_against_brute_force(device):
@@ -177,25 +182,6 @@ def test_how_far_mirrored_rays_miss_the_hull(device):
     assert bool((got[expected > 0.19] > 0.18).all())
 
 
-@pytest.mark.parametrize(
-    "name, value",
-    [
-        ("points", torch.zeros(60, 3)),
-        ("known", torch.ones(60, 4, dtype=torch.bool)),
-        ("known", torch.ones(60, 5)),
-        ("offset", torch.zeros(29)),
-        ("most", -0.1),
-        ("most", math.nan),
-    ],
-)
-def test_wrong_rays_and_planes_are_named(name, value):
-    masks, camera = sphere_views("cpu", size=16)
-    points, known, normal, offset = mirrored_rays("cpu")
-    inputs = dict(points=points, known=known, normal=normal, offset=offset, most=0.2) | {name: value}
-    with pytest.raises((TypeError, ValueError), match=name):
-        mirror_residual(**inputs, distance=mask_distance(masks), camera=camera)
-
-
 def test_rays_enter_and_leave_the_cones_of_sight(device):
     """Against the cones in float64, looked at every 0.001 along the ray."""
     masks, camera = sphere_views(device)
@@ -243,23 +229,32 @@ def test_object_cut_by_the_border_is_unbounded_only_there(device):
     assert [bool(v > 0) for v in got] == [True, False, False]
 
 
-@pytest.mark.parametrize(
-    "change, error",
-    [
-        (dict(points=torch.zeros(3)), ValueError),
-        (dict(points=torch.zeros(4, 3, dtype=torch.float64)), TypeError),
-        (dict(distance=torch.zeros(8, 1, 5)), ValueError),
-        (dict(camera=Camera(torch.zeros(7, 4, 4), torch.zeros(7, 4), 16, 16)), ValueError),
-        (dict(camera=Camera(torch.zeros(4, 4), torch.zeros(4), 16, 16)), ValueError),
-        (dict(camera=Camera(torch.zeros(8, 4, 4), torch.zeros(8, 4), 16, 15)), ValueError),
-        (dict(camera=torch.zeros(8, 4, 4)), TypeError),
-    ],
-)
-def test_wrong_input_is_named(change, error):
+WRONG = [
+    (hull_distance, "points", torch.zeros(3)),
+    (hull_distance, "points", torch.zeros(4, 3, dtype=torch.float64)),
+    (hull_distance, "distance", torch.zeros(8, 1, 5)),
+    (hull_distance, "camera", Camera(torch.zeros(7, 4, 4), torch.zeros(7, 4), 16, 16)),
+    (hull_distance, "camera", Camera(torch.zeros(4, 4), torch.zeros(4), 16, 16)),
+    (hull_distance, "camera", Camera(torch.zeros(8, 4, 4), torch.zeros(8, 4), 16, 15)),
+    (hull_distance, "camera", torch.zeros(8, 4, 4)),
+    (mirror_residual, "points", torch.zeros(60, 3)),
+    (mirror_residual, "known", torch.ones(60, 4, dtype=torch.bool)),
+    (mirror_residual, "known", torch.ones(60, 5)),
+    (mirror_residual, "offset", torch.zeros(29)),
+    (mirror_residual, "most", -0.1),
+    (mirror_residual, "most", math.nan),
+]
+
+
+@pytest.mark.parametrize("function, name, value", WRONG)
+def test_wrong_input_is_named(function, name, value):
     masks, camera = sphere_views("cpu", size=16)
-    inputs = dict(points=torch.zeros(4, 3), distance=mask_distance(masks), camera=camera) | change
-    with pytest.raises(error, match=next(iter(change))):
-        hull_distance(**inputs)
+    inputs = {"points": torch.zeros(4, 3)}
+    if function is mirror_residual:
+        inputs = dict(zip(("points", "known", "normal", "offset"), mirrored_rays("cpu"), strict=True), most=0.2)
+    inputs |= {"distance": mask_distance(masks), "camera": camera, name: value}
+    with pytest.raises((TypeError, ValueError), match=name):
+        function(**inputs)
 
 
 @pytest.mark.parametrize("mask", [torch.full((1, 4, 4), 2.0), torch.full((1, 4, 4), math.nan), torch.zeros(4, 4)])
@@ -282,10 +277,3 @@ def test_the_reach_is_that_of_the_points_inside(device, radius, views):
     empty = replace(maps, images=images - 1000.0)
     with pytest.raises(ValueError, match="masks: expected masks that overlap"):
         pipeline._hull_reach(LocalField(empty, model, None, None, None, None, None), 80)
-
-
-def test_far_from_the_contour_the_ends_of_segments_will_do(device):
-    """Beyond 16 pixels 0.25 / 16 too far at most; the disc itself is known to 0.1 pixels (above)."""
-    mask, true = disk(256, (127.3, 130.8), 60.2)
-    got = mask_distance(mask[None].to(device))[0].cpu()
-    assert (got - true).abs().max() < 0.1 + 0.25 / 16
