@@ -129,13 +129,11 @@ def full_precision(function: F) -> F:
 
     @functools.wraps(function)
     def wrapper(*args, **kwargs):
-        enabled = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
-        if not enabled:
-            return function(*args, **kwargs)
-        with contextlib.ExitStack() as stack:
-            for kind in enabled:
-                stack.enter_context(torch.autocast(kind, enabled=False))
-            return function(*args, **kwargs)
+        run = function
+        for kind in ("cpu", "cuda"):
+            if torch.is_autocast_enabled(kind):
+                run = torch.autocast(kind, enabled=False)(run)
+        return run(*args, **kwargs)
 
     return cast(F, wrapper)
 

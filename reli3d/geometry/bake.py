@@ -94,13 +94,8 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     ends = torch.stack([corners.reshape(-1, 2), corners.roll(-1, 1).reshape(-1, 2)], 1)[segments.long()]
     lower, upper = torch.aminmax(ends, dim=1)
     segment_start, segment_list = _bins(lower - BORDER_TEXELS, upper + BORDER_TEXELS, size, tile)
-    _bridge.launch(
-        kernels.texels_kernel,
-        (-(-size // tile)) ** 2,
-        [tiles, segment_start, segment_list, segments, BORDER_TEXELS, distance, face, bary],
-        device,
-        slice_min=TILES_MIN,
-    )
+    args = [tiles, segment_start, segment_list, segments, BORDER_TEXELS, distance, face, bary]
+    _bridge.launch(kernels.texels_kernel, (-(-size // tile)) ** 2, args, device, slice_min=TILES_MIN)
     return Texels(face, bary, distance == 0.0)
 
 

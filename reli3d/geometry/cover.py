@@ -43,7 +43,7 @@ def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Came
     lowest = _lowest(sdf)
     residual = sdf.new_empty(views, height // STRIDE, width // STRIDE)
     cameras = [v.detach().contiguous() for v in (camera.c2w, camera.intrinsics)]
-    inputs = [sdf, lowest, distance, *cameras, radius, DEPTH, FIELD_MAX, STRIDE, residual]
+    inputs = [sdf[..., None], lowest, distance, *cameras, radius, DEPTH, FIELD_MAX, STRIDE, residual]
     launch(kernels.residual_kernel, residual.numel(), inputs, sdf.device)
     residual = max_pool2d(residual, 3, 1, 1)  # dilated by a ray, so that interpolation reaches the silhouette's edge
     lowered = torch.empty_like(sdf)

@@ -62,15 +62,8 @@ class _Topology:
     def grid(self, sdf: Tensor, shift: Tensor | None) -> kernels.Grid:
         """The kernels' grid of the padded ``sdf`` and the offsets before padding."""
         shift = sdf.new_empty(0, 3) if shift is None else shift.view(-1, 3)
-        return struct_of(
-            kernels.Grid,
-            sdf=sdf.view(-1),
-            shift=shift,
-            ny=self.shape[1],
-            nz=self.shape[2],
-            cubes=wp.vec3i(*self.cubes),
-            pad=self.pad,
-        )
+        (_, ny, nz), cubes = self.shape, wp.vec3i(*self.cubes)
+        return struct_of(kernels.Grid, sdf=sdf.view(-1), shift=shift, ny=ny, nz=nz, cubes=cubes, pad=self.pad)
 
 
 @lru_cache(8)
@@ -162,9 +155,7 @@ def check_fields(sdf: Tensor, radius: float | Sequence[float], weights: CubeWeig
     for name, shape in shapes.items():
         value = getattr(weights, name)
         if value is not None:
-            check(name, value, like=sdf)
-            if tuple(value.shape) != tuple(shape):
-                raise ValueError(f"{name}: expected shape {tuple(shape)}, got {tuple(value.shape)}")
+            check(name, value, like=sdf, shape=shape)
     return extent
 
 
@@ -196,17 +187,13 @@ def topology_of(sdf: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topol
     cells = case.view(-1).nonzero().squeeze(1)
     _, y, z = sdf.shape
     i, j, k = cells // (y * z) - pad, cells // z % y - pad, cells % z - pad
-    rows = (i * size[1] + j) * size[2] + k
-    if pad:
-        real = (i >= 0) & (j >= 0) & (k >= 0) & (i < size[0]) & (j < size[1]) & (k < size[2])
-        rows = torch.where(real, rows, -1)
+    real = (i >= 0) & (j >= 0) & (k >= 0) & (i < size[0]) & (j < size[1]) & (k < size[2])
+    rows = torch.where(real, (i * size[1] + j) * size[2] + k, -1)
     if cubes is not None:
-        weight_rows = rows if not pad else rows[real]
-        if not torch.equal(weight_rows, cubes):
-            count = len(weight_rows)
+        if not torch.equal(rows[real], cubes):
+            count = int(real.sum())
             raise ValueError(f"cubes: expected surface_cubes(sdf), {count} of them, got {len(cubes)} others")
-        index = torch.cumsum(real, 0) - 1 if pad else torch.arange(len(cells), device=device, dtype=torch.int64)
-        rows = torch.where(real, index, -1) if pad else index
+        rows = torch.where(real, torch.cumsum(real, 0) - 1, -1)
     cells, rows = cells.to(torch.int32), rows.to(torch.int32)
     resolved, counts = torch.empty_like(cells), torch.empty_like(cells)
     slot = torch.empty(sdf.numel(), dtype=torch.int32, device=device)

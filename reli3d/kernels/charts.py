@@ -193,36 +193,25 @@ def pack_serial_kernel(
         best_x = wp.int32(0)
         turned = wp.int32(0)
         for x in range(size - width + 1):
-            y = wp.int32(0)
-            c = wp.int32(0)
-            while c < width:
-                y = wp.max(y, horizon[x + c] - bottom[base + c])
-                c += 1
-                if y >= best:
-                    c = width
-            if y < best:
-                best = y
-                best_x = x
-                turned = 0
-            y = wp.int32(0)
-            c = wp.int32(0)
-            while c < width:
-                y = wp.max(y, horizon[x + c] - (tall - top[base + width - 1 - c]))
-                c += 1
-                if y >= best:
-                    c = width
-            if y < best:
-                best = y
-                best_x = x
-                turned = 1
+            for turn in range(2):
+                y = wp.int32(0)
+                c = wp.int32(0)
+                while c < width and y < best:
+                    if turn == 0:
+                        y = wp.max(y, horizon[x + c] - bottom[base + c])
+                    else:
+                        y = wp.max(y, horizon[x + c] - (tall - top[base + width - 1 - c]))
+                    c += 1
+                if y < best:
+                    best = y
+                    best_x = x
+                    turned = turn
         place[i, 0] = best_x
         place[i, 1] = best
         place[i, 2] = turned
         place[i, 3] = tall
         for c in range(width):
-            t = top[base + c]
-            if turned == 1:
-                t = tall - bottom[base + width - 1 - c]
+            t = wp.where(turned == 1, tall - bottom[base + width - 1 - c], top[base + c])
             horizon[best_x + c] = wp.max(horizon[best_x + c], best + t)
             highest = wp.max(highest, best + t)
     height[0] = highest

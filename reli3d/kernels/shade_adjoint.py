@@ -155,9 +155,7 @@ def shade_adjoint_kernel(
                     add_texels(g_radiance, d.uv, wp.cw_mul(g_output, value) * scale)
     if g_normal.shape[0] != 0:
         wo = points.wo[i]
-        side = wp.float32(1.0)
-        if wp.dot(points.ng[i], wo) < 0.0:
-            side = -1.0
+        side = wp.where(wp.dot(points.ng[i], wo) < 0.0, -1.0, 1.0)
         g_n = wp.transpose(surface.frame) * total.n
         facing = points.normal[i] * side
         cos_o = wp.dot(facing, wo)
