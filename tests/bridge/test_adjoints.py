@@ -54,7 +54,7 @@ class Op:
 
 
 def triplane(g) -> Op:
-    batch, channels, height, width, count = 2, 40, 96, 128, 20_000
+    batch, channels, height, width, count = 2, 24, 48, 64, 3000
     planes = torch.randn(batch, 3, channels, height, width, generator=g)
     return Op(
         {"planes": planes, "points": torch.rand(batch, count, 3, generator=g) * 2.1 - 1.05},
@@ -245,7 +245,7 @@ def lobes(g, count):
 
 
 def irradiance(g) -> Op:
-    leaves = {"normals": op_cases.units(6000, 2), **lobes(g, 24)}
+    leaves = {"normals": op_cases.units(2000, 2), **lobes(g, 24)}
     return Op(
         leaves,
         lambda normals, *light: lobe_kernels.irradiance(SphericalGaussians(*light), normals),
@@ -256,7 +256,7 @@ def irradiance(g) -> Op:
 
 
 def gaussians(g) -> Op:
-    n = 6000
+    n = 2000
     normal = op_cases.units(n, 1)
     leaves = {
         "normal": normal,
@@ -276,7 +276,7 @@ def gaussians(g) -> Op:
 
 
 def normals(g) -> Op:
-    mesh = sheet(150)[0]
+    mesh = sheet(60)[0]
 
     def in_float64(vertices):
         a, b, c = (vertices[mesh.faces[:, k].long()] for k in range(3))
@@ -289,7 +289,7 @@ def normals(g) -> Op:
 
 
 def smoothing(g) -> Op:
-    mesh = sheet(size := 150)[0]
+    mesh = sheet(size := 60)[0]
     n = len(mesh.vertices)
     ends = torch.cat([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]).long()
     ends = torch.cat([ends, ends.flip(1)]).unique(dim=0)
@@ -317,7 +317,7 @@ OPS = {
 }
 
 
-# the reference of centers starts from vertices of the CPU; each axis of irradiance is a sum of 6000 terms, in any order
+# the reference of centers starts from vertices of the CPU; each axis of irradiance is a sum of 2000 terms, in any order
 ROUNDED_ON_CUDA = {("centers", "cuda"): 1e-3, ("irradiance", "cuda"): 1e-3}
 
 

@@ -59,7 +59,7 @@ def chart_count(mesh: Mesh) -> int:
 
 def utilization(mesh: Mesh) -> float:
     """Fraction of the UV square that faces cover."""
-    return float((coverage(mesh, 2048) > 0).float().mean())
+    return float((coverage(mesh, 1024) > 0).float().mean())
 
 
 def stretches(mesh: Mesh) -> tuple[float, float]:
@@ -146,7 +146,7 @@ def test_faces_have_area_and_do_not_overlap(name):
     assert name != "ramp" or chart_count(result) <= 10  # five turns: each one chart, or cut once
 
 
-@pytest.mark.parametrize("name", QUICK + [pytest.param(n, marks=slow) for n in SLOW])
+@pytest.mark.parametrize("name", QUICK[1:4] + [pytest.param(n, marks=slow) for n in (QUICK[0], QUICK[4], *SLOW)])
 def test_real_meshes_have_area_everywhere_and_no_overlap(shared_data, name):
     mesh = loaded(shared_data / "meshes" / f"{name}.glb")
     check_atlas(mesh, unwrap(mesh, texture_size=1024))
@@ -160,7 +160,7 @@ def test_a_single_triangle_and_nothing_but_points(faces):
 
 
 def test_sphere_fills_the_atlas_with_little_stretch():
-    mesh = icosphere(5)
+    mesh = icosphere(4)
     result = unwrap(mesh, texture_size=1024)
     check_atlas(mesh, result)
     assert chart_count(result) == 6 and utilization(result) > 0.55
@@ -196,7 +196,7 @@ def test_charts_keep_the_guard_band(size):
 
 
 def test_the_atlas_is_bitwise_identical_again_and_for_any_number_of_threads(threads):
-    mesh, results = icosphere(5), []
+    mesh, results = icosphere(4), []
     for n in (1, 2, 5, 1):
         threads(n)
         results.append(unwrap(mesh, texture_size=512))
