@@ -145,22 +145,6 @@ def test_slices_within_slices_come_to_an_end(threads):
     assert inner == [1 << 15] * _bridge.SLICES
 
 
-@pytest.mark.parametrize(
-    "value, options, error, message",
-    [
-        ([1.0], {}, TypeError, "x: expected a tensor, got list"),
-        (torch.ones(3, dtype=torch.float64), {}, TypeError, "x: expected torch.float32, got torch.float64"),
-        (torch.ones(3), {"dtype": torch.int32}, TypeError, "x: expected torch.int32, got torch.float32"),
-        (torch.ones(2, 4), {"last": 3}, ValueError, r"x: expected shape \(..., 3\), got \(2, 4\)"),
-        (torch.tensor(1.0), {"last": 3}, ValueError, r"x: expected shape \(..., 3\), got \(\)"),
-        (torch.ones(3), {"like": torch.ones(3, device="meta")}, ValueError, "x: expected device meta, got cpu"),
-    ],
-)
-def test_check_reports_the_expected_value(value, options, error, message):
-    with pytest.raises(error, match=message):
-        _bridge.check("x", value, **options)
-
-
 LAUNCH = """
 import sys
 sys.path.insert(0, {root!r})

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from reli3d import pipeline
 from reli3d.geometry.camera import Camera
-from reli3d.geometry.hull import hull_distance, hull_grid, hull_span, mask_distance, mirror_residual
+from reli3d.geometry.hull import hull_distance, hull_span, mask_distance, mirror_residual
 from reli3d.nn.local import LocalField
 from reli3d.nn.presets import SMALL
 from reli3d.nn.view_features import ViewMaps
@@ -136,23 +136,6 @@ def test_with_far_only_points_far_outside_differ(device):
     near = whole >= -0.3
     assert torch.equal(got[near], whole[near]) and bool((got[~near] < -0.3).all())
     assert int((got != whole).sum()) > 500, "views are left out"
-
-
-@pytest.mark.parametrize("views, eyes, focal", [(8, 3.0, 300.0), (40, 1.2, 120.0), (3, 0.6, 60.0), (1, 3.0, 300.0)])
-@pytest.mark.parametrize("far", [math.inf, 0.2, 0.0])
-def test_a_grid_has_the_values_of_its_points(device, views, eyes, focal, far):
-    """Ragged masks, wide angles, more views than a block culls, and points behind cameras."""
-    _, camera = sphere_views(device, n=views, distance=eyes, size=128, focal=focal)
-    noise = torch.rand(views, 1, 16, 16, generator=torch.Generator().manual_seed(views))
-    masks = torch.nn.functional.interpolate(noise, size=(128, 128), mode="bilinear")[:, 0]
-    masks = ((masks - 0.4) * 20.0).clamp(0, 1).to(device)
-    distance, axis = mask_distance(masks), torch.linspace(-0.7, 0.7, 42, device=device)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    whole = hull_distance(points, distance, camera)
-    got = hull_grid(axis, distance, camera, far=far).view(-1)
-    near = whole >= -far
-    assert torch.equal(got[near], whole[near]) and bool((got[~near] < -far).all())
-    assert eyes > 1.0 or int((whole == -1000.0).sum()) > 100, "cameras stand among the points"
 
 
 def mirrored_rays(device):

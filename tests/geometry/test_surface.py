@@ -109,15 +109,6 @@ def test_one_inside_vertex_has_the_eight_dual_vertices_of_the_closed_form(device
     assert volume(mesh) == pytest.approx((2 * 0.8 / 12) ** 3, rel=1e-5)  # a cube of that half side
 
 
-@pytest.mark.parametrize("case", range(1, 255, 23))
-def test_one_cube_is_closed_at_the_box(device, case):
-    sdf = sign_pattern(case).contiguous().to(device)
-    mesh = extract_surface(sdf, radius=1.0, weights=CubeWeights(**random_weights(sdf.shape, case, device)))
-    found = report(mesh)
-    assert found.watertight and found.manifold, found
-    assert volume(mesh) > 0
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_is_a_closed_manifold_with_the_inside_on_the_inner_side(device, seed):
     rng = torch.Generator().manual_seed(seed)

@@ -21,29 +21,6 @@ def icosphere(subdivisions: int) -> Mesh:
     return mesh_from(trimesh.creation.icosphere(subdivisions))
 
 
-def test_cuts_are_judged_by_the_boxes_of_their_pieces():
-    """Against numpy in float64, which sums in another order; also charts of one point and of two equal ones."""
-    generator = np.random.default_rng(0)
-    sizes = [1, 2, 7, 400, 33]
-    points = [generator.normal(size=(n, 2)) * generator.uniform(0.1, 30.0, 2) for n in sizes]
-    points[1][1] = points[1][0]
-    angle = np.arange(charts.CUT_ANGLES) * (np.pi / charts.CUT_ANGLES)
-    axes = np.stack([np.cos(angle), np.sin(angle)])
-    at, area = charts.cuts(np.concatenate(points) @ axes, np.cumsum([0, *sizes]).astype(np.int32))
-
-    def box(piece: np.ndarray) -> float:
-        extent = np.ptp(piece @ axes, axis=0) if len(piece) else np.zeros(8)
-        return min(extent[k] * extent[(k + 4) % 8] for k in range(8))
-
-    for c, chart in enumerate(points):
-        for k in range(8):
-            along = chart @ axes[:, k]
-            for kind, place in enumerate([(along.max() + along.min()) / 2, along.mean()]):
-                np.testing.assert_allclose(at[c, k, kind], place, rtol=1e-12, atol=1e-12)
-                upper = along > at[c, k, kind]
-                np.testing.assert_allclose(area[c, k, kind], box(chart[upper]) + box(chart[~upper]), rtol=1e-12)
-
-
 def areas(mesh: Mesh) -> np.ndarray:
     """Signed area in (u, 1 - v), float64, of the faces as stored in float32."""
     q = mesh.uv.numpy()[mesh.faces.numpy()].astype(np.float64)
