@@ -118,18 +118,6 @@ def _unit(values: Tensor, corner: Tensor, weight: Tensor) -> Tensor:
     return normalize(torch.where(none, values[corner[:, 0]], mean), dim=1)
 
 
-def _positions_normals(mesh: Mesh, corner: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
-    return _interpolated(mesh.vertices.detach(), corner, weight), _unit(normals.detach(), corner, weight)
-
-
-def _tangents(mesh: Mesh, corner: Tensor, weight: Tensor) -> Tensor:
-    if mesh.tangents is None:
-        raise ValueError("mesh.tangents: expected tangents, got None (see Mesh.with_tangents)")
-    tangents = mesh.tangents.detach()
-    return torch.cat([_unit(tangents[:, :3], corner, weight), tangents[corner[:, 0], 3:]], 1)
-
-
 def bake(
     mesh: Mesh,
     size: int,
@@ -166,15 +154,19 @@ def bake(
     index = torch.nonzero(texels.valid.reshape(-1)).reshape(-1)
     if len(index) == 0:
         raise ValueError("mesh.uv: expected a surface within [0, 1]^2, got one that covers no texel")
+    if tangents and mesh.tangents is None:
+        raise ValueError("mesh.tangents: expected tangents, got None (see Mesh.with_tangents)")
     maps: dict[str, Tensor] = {}
     with torch.no_grad():
+        normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
         for part in index.split(chunk):
             corner, weight = _corner_weights(mesh, texels, part)
-            arguments: tuple[Tensor, ...] = _positions_normals(mesh, corner, weight)
-            if tangents:
-                arguments = (*arguments, _tangents(mesh, corner, weight))
+            arguments = [_interpolated(mesh.vertices, corner, weight), _unit(normals, corner, weight)]
+            if tangents and mesh.tangents is not None:
+                along = _unit(mesh.tangents[:, :3], corner, weight)
+                arguments.append(torch.cat([along, mesh.tangents[corner[:, 0], 3:]], 1))
             if values is not None:
-                arguments = (*arguments, _interpolated(values.detach(), corner, weight))
+                arguments.append(_interpolated(values, corner, weight))
             found = fn(*arguments)
             found = {"value": found} if isinstance(found, Tensor) else found
             if maps and found.keys() != maps.keys():

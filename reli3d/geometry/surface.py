@@ -229,8 +229,8 @@ class _DualVertices(torch.autograd.Function):
         inputs = [None if v is None else v.detach().contiguous() for v in (deformation, alpha, beta)]
         arguments = [cube, group, *_DualVertices.arguments(t, padded, inputs, scale), vertices]
         launch(kernels.dual_vertex_kernel, len(cube), arguments, device)
-        ctx.topology, ctx.scale, ctx.given = topology, scale, [v is not None for v in (deformation, alpha, beta)]
-        ctx.save_for_backward(padded, sdf, *(v for v in (deformation, alpha, beta) if v is not None))
+        ctx.topology, ctx.scale = topology, scale
+        ctx.save_for_backward(padded, sdf, deformation, alpha, beta)
         return vertices
 
     @staticmethod
@@ -246,9 +246,8 @@ class _DualVertices(torch.autograd.Function):
         from reli3d.kernels import flexicubes_adjoint
 
         t, device = ctx.topology, g_vertices.device
-        padded, sdf, *rest = ctx.saved_tensors
-        rest = iter(rest)
-        inputs = [next(rest).contiguous() if given else None for given in ctx.given]
+        padded, sdf, *given = ctx.saved_tensors
+        inputs = [None if v is None else v.contiguous() for v in given]
         n = len(t.cells)
         g_sdf, g_alpha, g_beta = (torch.zeros(n, width, device=device, dtype=torch.float32) for width in (8, 8, 12))
         g_shift = torch.zeros(n, 8, 3, device=device, dtype=torch.float32)

@@ -35,17 +35,11 @@ def overlap(corners: wp.array2d[wp.vec2], i: int, j: int, slack: float) -> bool:
     b0 = corners[j, 0]
     b1 = corners[j, 1]
     b2 = corners[j, 2]
-    if separates(a0, a1, b0, b1, b2, slack):
+    if separates(a0, a1, b0, b1, b2, slack) or separates(b0, b1, a0, a1, a2, slack):
         return False
-    if separates(a1, a2, b0, b1, b2, slack):
+    if separates(a1, a2, b0, b1, b2, slack) or separates(b1, b2, a0, a1, a2, slack):
         return False
-    if separates(a2, a0, b0, b1, b2, slack):
-        return False
-    if separates(b0, b1, a0, a1, a2, slack):
-        return False
-    if separates(b1, b2, a0, a1, a2, slack):
-        return False
-    return not separates(b2, b0, a0, a1, a2, slack)
+    return not (separates(a2, a0, b0, b1, b2, slack) or separates(b2, b0, a0, a1, a2, slack))
 
 
 @wp.kernel

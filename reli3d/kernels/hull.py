@@ -151,16 +151,6 @@ def hull_span_kernel(
 
 
 @wp.func
-def crosses(mask: wp.array3d[float], view: int, y: int, x: int) -> bool:
-    """Whether the contour runs through a cell."""
-    count = wp.int32(0)
-    for k in range(4):
-        if mask[view, y + k // 2, x + k % 2] >= 0.5:
-            count += 1
-    return count > 0 and count < 4
-
-
-@wp.func
 def squared_to_segment(p: wp.vec2, a: wp.vec2, b: wp.vec2) -> float:
     ab = b - a
     t = wp.clamp(wp.dot(p - a, ab) / wp.max(wp.dot(ab, ab), 1.0e-12), 0.0, 1.0)
@@ -176,7 +166,7 @@ def crossing(a: float, b: float) -> float:
 
 @wp.func
 def squared_to_contour(mask: wp.array3d[float], view: int, y: int, x: int, p: wp.vec2) -> float:
-    """Squared distance of ``p`` (column, row in pixel centers) to the contour inside cell (y, x), which it crosses."""
+    """Squared distance of ``p`` (column, row in pixel centers) to the contour inside cell (y, x); inf without any."""
     m00 = mask[view, y, x]
     m01 = mask[view, y, x + 1]
     m10 = mask[view, y + 1, x]
@@ -186,6 +176,8 @@ def squared_to_contour(mask: wp.array3d[float], view: int, y: int, x: int, p: wp
     bottom = (m10 >= 0.5) != (m11 >= 0.5)
     left = (m00 >= 0.5) != (m10 >= 0.5)
     right = (m01 >= 0.5) != (m11 >= 0.5)
+    if not (top or bottom or left or right):
+        return wp.inf
     t = wp.vec2(crossing(m00, m01), 0.0)  # undefined and unused where the contour does not cross a side
     b = wp.vec2(crossing(m10, m11), 1.0)
     l = wp.vec2(0.0, crossing(m00, m10))
@@ -316,7 +308,6 @@ def mask_distance_kernel(
         neighbors = -1  # no cell
     for v in range(cell_y - 1, cell_y + neighbors):
         for u in range(cell_x - 1, cell_x + neighbors):
-            inner = v >= 0 and v < height - 1 and u >= 0 and u < width - 1
-            if inner and crosses(mask, view, v, u):
+            if v >= 0 and v < height - 1 and u >= 0 and u < width - 1:
                 best = wp.min(best, squared_to_contour(mask, view, v, u, p))
     distance[view, y, x] = wp.where(mask[view, y, x] >= 0.5, wp.sqrt(best), -wp.sqrt(best))

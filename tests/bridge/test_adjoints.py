@@ -204,7 +204,7 @@ def lobes(g, count):
 
 
 def irradiance(g) -> Op:
-    leaves = {"normals": op_cases.units(2000, 2), **lobes(g, 24)}
+    leaves = {"normals": op_cases.units(6000, 2), **lobes(g, 24)}
     return Op(
         leaves,
         lambda normals, *light: lobe_kernels.irradiance(SphericalGaussians(*light), normals),
@@ -263,7 +263,7 @@ OPS = {
 }
 
 
-# each axis of irradiance is a sum of 2000 terms, in any order
+# each axis of irradiance is a sum of 6000 terms, in any order
 ROUNDED_ON_CUDA = {("irradiance", "cuda"): 1e-3}
 
 
