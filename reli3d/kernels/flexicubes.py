@@ -5,10 +5,6 @@ The grid has ``nx * ny * nz`` vertices; vertex (i, j, k) has the index ``(i * ny
 of its lowest corner, so there is no cube at the last index of an axis.  Inside is sdf < 0.  If ``pad`` is 1, the grid
 was padded by one layer of vertices with a positive value, which lie at the positions of the border vertices.  The cubes
 of this layer have zero thickness and cap the surface flat at the box.
-
-Dual marching cubes is ambiguous where two cubes share a face with four crossed edges (cases C16 and C19 of Wenger 2013,
-Isosurfaces): four quads would meet in one edge and make the surface non-manifold.  :func:`resolve_kernel` changes these
-cases.
 """
 
 import warp as wp
