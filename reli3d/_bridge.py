@@ -35,21 +35,6 @@ SLICE_MIN = 1024  # kernel threads per slice: below this a slice costs about as 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable)
 
-_TORCH = {
-    wp.float32: (torch.float32, ()),
-    wp.int16: (torch.int16, ()),
-    wp.int32: (torch.int32, ()),
-    wp.int64: (torch.int64, ()),
-    wp.uint8: (torch.uint8, ()),
-    wp.bool: (torch.bool, ()),
-    wp.vec2: (torch.float32, (2,)),
-    wp.vec3: (torch.float32, (3,)),
-    wp.vec4: (torch.float32, (4,)),
-    wp.vec4d: (torch.float64, (4,)),
-    wp.mat33: (torch.float32, (3, 3)),
-    wp.mat44: (torch.float32, (4, 4)),
-}
-
 
 @lru_cache(1)
 def pool() -> ThreadPoolExecutor:
@@ -129,13 +114,11 @@ def full_precision(function: F) -> F:
 
     @functools.wraps(function)
     def wrapper(*args, **kwargs):
-        enabled = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
-        if not enabled:
-            return function(*args, **kwargs)
-        with contextlib.ExitStack() as stack:
-            for kind in enabled:
-                stack.enter_context(torch.autocast(kind, enabled=False))
-            return function(*args, **kwargs)
+        run = function
+        for kind in ("cpu", "cuda"):
+            if torch.is_autocast_enabled(kind):
+                run = torch.autocast(kind, enabled=False)(run)
+        return run(*args, **kwargs)
 
     return cast(F, wrapper)
 
@@ -206,8 +189,8 @@ def _check_device(args: Iterable, device: torch.device) -> None:
 
 def empty(shape: Sequence[int], dtype, device: torch.device) -> Tensor:
     """Uninitialized torch tensor for a Warp array of ``shape`` and type ``dtype``."""
-    torch_dtype, tail = _TORCH[dtype]
-    return torch.empty((*shape, *tail), dtype=torch_dtype, device=device)
+    scalar, tail = getattr(dtype, "_wp_scalar_type_", dtype), getattr(dtype, "_shape_", ())
+    return torch.empty((*shape, *tail), dtype=wp.dtype_to_torch(scalar), device=device)
 
 
 def load_modules(modules: Sequence[ModuleType], device: torch.device) -> None:
@@ -314,10 +297,9 @@ class _KernelOp(torch.autograd.Function):
             torch.zeros((len(parts) if i in shared else 1, *t.shape), dtype=t.dtype, device=device) if w else None
             for i, (t, w) in enumerate(zip(tensors, needed, strict=True))
         ]
-        g_results = [None if g is None else g.contiguous() for g in g_outs]
         g_results = [
-            torch.zeros_like(r) if g is None and r.is_floating_point() else g
-            for g, r in zip(g_results, results, strict=True)
+            g.contiguous() if g is not None else torch.zeros_like(r) if r.is_floating_point() else None
+            for g, r in zip(g_outs, results, strict=True)
         ]
         if n > 0:
             with stream(device) as name:

@@ -94,13 +94,8 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     ends = torch.stack([corners.reshape(-1, 2), corners.roll(-1, 1).reshape(-1, 2)], 1)[segments.long()]
     lower, upper = torch.aminmax(ends, dim=1)
     segment_start, segment_list = _bins(lower - BORDER_TEXELS, upper + BORDER_TEXELS, size, tile)
-    _bridge.launch(
-        kernels.texels_kernel,
-        (-(-size // tile)) ** 2,
-        [tiles, segment_start, segment_list, segments, BORDER_TEXELS, distance, face, bary],
-        device,
-        slice_min=TILES_MIN,
-    )
+    args = [tiles, segment_start, segment_list, segments, BORDER_TEXELS, distance, face, bary]
+    _bridge.launch(kernels.texels_kernel, (-(-size // tile)) ** 2, args, device, slice_min=TILES_MIN)
     return Texels(face, bary, distance == 0.0)
 
 
@@ -121,18 +116,6 @@ def _unit(values: Tensor, corner: Tensor, weight: Tensor) -> Tensor:
     mean = _interpolated(values, corner, weight)
     none = mean.square().sum(1, keepdim=True) < 1e-12
     return normalize(torch.where(none, values[corner[:, 0]], mean), dim=1)
-
-
-def _positions_normals(mesh: Mesh, corner: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
-    return _interpolated(mesh.vertices.detach(), corner, weight), _unit(normals.detach(), corner, weight)
-
-
-def _tangents(mesh: Mesh, corner: Tensor, weight: Tensor) -> Tensor:
-    if mesh.tangents is None:
-        raise ValueError("mesh.tangents: expected tangents, got None (see Mesh.with_tangents)")
-    tangents = mesh.tangents.detach()
-    return torch.cat([_unit(tangents[:, :3], corner, weight), tangents[corner[:, 0], 3:]], 1)
 
 
 def bake(
@@ -171,15 +154,19 @@ def bake(
     index = torch.nonzero(texels.valid.reshape(-1)).reshape(-1)
     if len(index) == 0:
         raise ValueError("mesh.uv: expected a surface within [0, 1]^2, got one that covers no texel")
+    if tangents and mesh.tangents is None:
+        raise ValueError("mesh.tangents: expected tangents, got None (see Mesh.with_tangents)")
     maps: dict[str, Tensor] = {}
     with torch.no_grad():
+        normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
         for part in index.split(chunk):
             corner, weight = _corner_weights(mesh, texels, part)
-            arguments: tuple[Tensor, ...] = _positions_normals(mesh, corner, weight)
-            if tangents:
-                arguments = (*arguments, _tangents(mesh, corner, weight))
+            arguments = [_interpolated(mesh.vertices, corner, weight), _unit(normals, corner, weight)]
+            if tangents and mesh.tangents is not None:
+                along = _unit(mesh.tangents[:, :3], corner, weight)
+                arguments.append(torch.cat([along, mesh.tangents[corner[:, 0], 3:]], 1))
             if values is not None:
-                arguments = (*arguments, _interpolated(values.detach(), corner, weight))
+                arguments.append(_interpolated(values, corner, weight))
             found = fn(*arguments)
             found = {"value": found} if isinstance(found, Tensor) else found
             if maps and found.keys() != maps.keys():

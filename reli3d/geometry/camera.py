@@ -58,10 +58,8 @@ class Camera(Movable):
     def from_fov(cls, c2w: Tensor, fov_x: float, width: int, height: int) -> "Camera":
         """Camera with square pixels and the principal point at the image center.
 
-        c2w: ``(..., 4, 4)`` float32 camera-to-world, such as from :func:`look_at`.  fov_x: full horizontal field of
-        view in radians, in (0, pi); ``fx = fy = width / (2 tan(fov_x / 2))``.  width, height: pixels.  Gradients reach
-        ``c2w``.  Raises TypeError for a wrong dtype, ValueError for a wrong shape, or a size or field of view out of
-        range.
+        c2w, width, height: those of the camera.  fov_x: full horizontal field of view in radians, in (0, pi); ``fx = fy
+        = width / (2 tan(fov_x / 2))``.  Gradients reach ``c2w``.  Raises ValueError for a field of view out of range.
         """
         c2w = tensor_of(c2w)
         check("c2w", c2w, last=4)

@@ -187,15 +187,9 @@ def _cut_bulky(
     x, y = (np.einsum("pk,pk->p", points[outer], v[chart[outer]]) for v in (right, up))
     angles = np.arange(CUT_ANGLES) * (np.pi / CUT_ANGLES)
     turned = [x * np.cos(a) + y * np.sin(a) for a in angles]
-
-    def extents(begin: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
-        return np.stack([np.maximum.reduceat(v, begin) - np.minimum.reduceat(v, begin) for v in values])
-
-    def boxes(extent: np.ndarray) -> np.ndarray:
-        return (extent * np.roll(extent, CUT_ANGLES // 2, 0)).min(0)
-
-    extent = extents(start, turned)
-    box, axis, long = boxes(extent), extent.argmax(0), extent.max(0) > longest
+    extent = np.stack([np.maximum.reduceat(v, start) - np.minimum.reduceat(v, start) for v in turned])
+    box = (extent * np.roll(extent, CUT_ANGLES // 2, 0)).min(0)
+    axis, long = extent.argmax(0), extent.max(0) > longest
     bulky = (box - area > waste) & (area < CUT_FILL * box) | long
     if not bulky.any():
         return None

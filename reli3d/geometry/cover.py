@@ -2,7 +2,7 @@
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import max_pool2d, max_pool3d
 
 from reli3d._bridge import check, launch
 from reli3d.geometry.camera import Camera, check_camera
@@ -40,25 +40,14 @@ def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Came
     if views == 0:
         return sdf.detach().clone()
     sdf, bound, distance = (v.detach().contiguous() for v in (sdf, bound, distance))
-    lowest = _lowest(sdf)
+    block = kernels.BLOCK_CELLS  # minima of blocks, border points included
+    lowest = -max_pool3d(-sdf[None, None], block + 1, block, ceil_mode=True)[0, 0]
     residual = sdf.new_empty(views, height // STRIDE, width // STRIDE)
     cameras = [v.detach().contiguous() for v in (camera.c2w, camera.intrinsics)]
-    inputs = [sdf, lowest, distance, *cameras, radius, DEPTH, FIELD_MAX, STRIDE, residual]
+    inputs = [sdf[..., None], lowest, distance, *cameras, radius, DEPTH, FIELD_MAX, STRIDE, residual]
     launch(kernels.residual_kernel, residual.numel(), inputs, sdf.device)
     residual = max_pool2d(residual, 3, 1, 1)  # dilated by a ray, so that interpolation reaches the silhouette's edge
     lowered = torch.empty_like(sdf)
     inputs = [sdf, bound, residual, *cameras, radius, FIELD_MAX, STRIDE, lowered]
     launch(kernels.lower_kernel, sdf.numel(), inputs, sdf.device)
     return lowered
-
-
-def _lowest(sdf: Tensor) -> Tensor:
-    """Minimum of ``sdf`` over each block of ``kernels.BLOCK_CELLS`` cells a side, border points included."""
-    for axis in range(3):
-        cells = sdf.shape[axis] - 1
-        most = (
-            torch.arange(-(-cells // kernels.BLOCK_CELLS), device=sdf.device, dtype=torch.int64) * kernels.BLOCK_CELLS
-        )
-        points = [sdf.index_select(axis, (most + k).clamp(max=cells)) for k in range(kernels.BLOCK_CELLS + 1)]
-        sdf = torch.stack(points).amin(0)
-    return sdf.contiguous()

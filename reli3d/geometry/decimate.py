@@ -1,7 +1,4 @@
-"""Decimation of a surface by ``fast-simplification`` (MIT), an optional dependency.
-
-``manifold3d`` can decimate too, but it takes a tolerance instead of a face count, and accepts solids only.
-"""
+"""Decimation of a surface by ``fast-simplification`` (MIT), an optional dependency."""
 
 import threading
 

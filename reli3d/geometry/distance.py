@@ -1,11 +1,11 @@
 """Signed distance to closed meshes, the ground truth for volume points in training."""
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from reli3d import _bridge
 from reli3d.geometry.mesh import check_topology
+from reli3d.geometry.rays import warp_mesh
 from reli3d.kernels import distance as kernels
 
 
@@ -25,10 +25,7 @@ def signed_distance(vertices: Tensor, faces: Tensor, points: Tensor) -> Tensor:
     vertices, faces, points = vertices.detach().contiguous(), faces.contiguous(), points.detach().contiguous()
     finite = torch.isfinite(points).all(-1)
     distance = points.new_empty(len(points))
-    with _bridge.stream(points.device):
-        mesh = wp.Mesh(
-            points=_bridge.array_of(vertices, wp.vec3), indices=_bridge.array_of(faces.reshape(-1), wp.int32)
-        )
+    mesh = warp_mesh(vertices, faces)
     safe = torch.where(finite[:, None], points, torch.zeros_like(points))
     reach = 4.0 * float(torch.cat([vertices, safe]).abs().max()) + 1.0  # longer than any distance that can occur
     _bridge.launch(kernels.signed_distance_kernel, len(points), [mesh.id, safe, reach, distance], points.device)

@@ -54,11 +54,11 @@ def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: floa
     gradient.
     """
     check("points", points, shape=("N", 3))
-    _check_views(points, distance, camera)
+    views = _views(points, distance, camera)
     if not far >= 0.0:
         raise ValueError(f"far: expected at least 0, got {far}")
     hull = torch.empty(len(points), device=points.device, dtype=torch.float32)
-    inputs = [points.detach().contiguous(), *_views(distance, camera), far, hull]
+    inputs = [points.detach().contiguous(), *views, far, hull]
     launch(kernels.hull_distance_kernel, len(points), inputs, points.device)
     return hull
 
@@ -90,11 +90,11 @@ def mirror_residual(
         raise ValueError(f"normal, offset: expected (P, 3) and (P,), got {tuple(normal.shape)}, {tuple(offset.shape)}")
     if not most >= 0.0:
         raise ValueError(f"most: expected at least 0, got {most}")
-    _check_views(points, distance, camera)
+    views = _views(points, distance, camera)
     residual = points.new_empty(len(normal), len(points))
     rays = [points.detach().contiguous(), known.contiguous()]
     planes = [normal.detach().contiguous(), offset.detach().contiguous()]
-    inputs = [*rays, *planes, float(most), *_views(distance, camera), residual]
+    inputs = [*rays, *planes, float(most), *views, residual]
     launch(kernels.mirror_residual_kernel, residual.numel(), inputs, points.device)
     return residual
 
@@ -114,20 +114,18 @@ def hull_span(origins: Tensor, directions: Tensor, radius: float, distance: Tens
         raise ValueError(f"origins, directions: expected (N, 3) both, got {shapes}")
     if not 0.0 < radius < 100.0:
         raise ValueError(f"radius: expected between 0 and 100, got {radius}")
-    _check_views(origins, distance, camera)
+    views = _views(origins, distance, camera)
     span = torch.empty(len(origins), 2, device=origins.device, dtype=torch.float32)
     rays = [v.detach().contiguous() for v in (origins, directions)]
-    inputs = [*rays, float(radius), *_views(distance, camera), span]
+    inputs = [*rays, float(radius), *views, span]
     launch(kernels.hull_span_kernel, len(origins), inputs, origins.device)
     return span
 
 
-def _check_views(points: Tensor, distance: Tensor, camera: Camera) -> None:
+def _views(points: Tensor, distance: Tensor, camera: Camera) -> list[Tensor]:
+    """The kernels' arguments of the views, checked."""
     check("distance", distance, like=points)
     if distance.ndim != 3 or min(distance.shape[1:]) < 2:
         raise ValueError(f"distance: expected shape (V, H, W) with H and W above 1, got {tuple(distance.shape)}")
     check_camera(camera, like=points, views=len(distance), size=distance.shape[1:])
-
-
-def _views(distance: Tensor, camera: Camera) -> list:
     return [value.detach().contiguous() for value in (distance, camera.c2w, camera.intrinsics)]

@@ -149,13 +149,8 @@ class RayScene:
             return (t_max >= 0.0) & ~self.occluded(origins, directions, t_max=t_max)
         left, group = t_max.clone(memory_format=torch.contiguous_format), embree_kernels.GROUP
         args = [embree.query("rtcOccluded16"), self._embree.scene, origins.contiguous(), directions.contiguous(), left]
-        launch(
-            embree_kernels.embree_unoccluded_kernel,
-            -(-len(left) // group),
-            args,
-            self.device,
-            slice_min=SLICE_RAYS // group,
-        )
+        kernel, count = embree_kernels.embree_unoccluded_kernel, -(-len(left) // group)
+        launch(kernel, count, args, self.device, slice_min=SLICE_RAYS // group)
         return left >= 0.0
 
     @property
@@ -187,16 +182,10 @@ class RayScene:
         return partial(RayScene, backend=self.backend), (self.vertices, self.faces)
 
     def _build(self) -> None:
-        if self.faces.shape[0] == 0:
-            return
-        if self.backend == "warp":
-            with stream(self.device):
-                self._warp = wp.Mesh(
-                    points=array_of(self.vertices, wp.vec3),
-                    indices=array_of(self.faces.reshape(-1), wp.int32),
-                )
-            return
-        self._embree = embree.Tree(self.vertices.numpy(), self.faces.numpy())
+        if len(self.faces) and self.backend == "embree":
+            self._embree = embree.Tree(self.vertices.numpy(), self.faces.numpy())
+        elif len(self.faces):
+            self._warp = warp_mesh(self.vertices, self.faces)
 
     def _rays(self, origins, directions, t_max):
         origins, directions = tensor_of(origins), tensor_of(directions)
@@ -248,6 +237,12 @@ class RayScene:
         if np.count_nonzero(keys[1:] != keys[:-1]) < 0.5 * n:
             return None
         return np.argsort(keys, kind="stable")  # a radix sort for 16 bits
+
+
+def warp_mesh(vertices: Tensor, faces: Tensor) -> wp.Mesh:
+    """Warp's structure on the memory of contiguous ``vertices (V, 3)`` and ``faces (F, 3)``."""
+    with stream(vertices.device):
+        return wp.Mesh(points=array_of(vertices, wp.vec3), indices=array_of(faces.reshape(-1), wp.int32))
 
 
 def _items(values: Tensor) -> np.ndarray:

@@ -62,15 +62,8 @@ class _Topology:
     def grid(self, sdf: Tensor, shift: Tensor | None) -> kernels.Grid:
         """The kernels' grid of the padded ``sdf`` and the offsets before padding."""
         shift = sdf.new_empty(0, 3) if shift is None else shift.view(-1, 3)
-        return struct_of(
-            kernels.Grid,
-            sdf=sdf.view(-1),
-            shift=shift,
-            ny=self.shape[1],
-            nz=self.shape[2],
-            cubes=wp.vec3i(*self.cubes),
-            pad=self.pad,
-        )
+        (_, ny, nz), cubes = self.shape, wp.vec3i(*self.cubes)
+        return struct_of(kernels.Grid, sdf=sdf.view(-1), shift=shift, ny=ny, nz=nz, cubes=cubes, pad=self.pad)
 
 
 @lru_cache(8)
@@ -162,9 +155,7 @@ def check_fields(sdf: Tensor, radius: float | Sequence[float], weights: CubeWeig
     for name, shape in shapes.items():
         value = getattr(weights, name)
         if value is not None:
-            check(name, value, like=sdf)
-            if tuple(value.shape) != tuple(shape):
-                raise ValueError(f"{name}: expected shape {tuple(shape)}, got {tuple(value.shape)}")
+            check(name, value, like=sdf, shape=shape)
     return extent
 
 
@@ -196,17 +187,13 @@ def topology_of(sdf: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topol
     cells = case.view(-1).nonzero().squeeze(1)
     _, y, z = sdf.shape
     i, j, k = cells // (y * z) - pad, cells // z % y - pad, cells % z - pad
-    rows = (i * size[1] + j) * size[2] + k
-    if pad:
-        real = (i >= 0) & (j >= 0) & (k >= 0) & (i < size[0]) & (j < size[1]) & (k < size[2])
-        rows = torch.where(real, rows, -1)
+    real = (i >= 0) & (j >= 0) & (k >= 0) & (i < size[0]) & (j < size[1]) & (k < size[2])
+    rows = torch.where(real, (i * size[1] + j) * size[2] + k, -1)
     if cubes is not None:
-        weight_rows = rows if not pad else rows[real]
-        if not torch.equal(weight_rows, cubes):
-            count = len(weight_rows)
+        if not torch.equal(rows[real], cubes):
+            count = int(real.sum())
             raise ValueError(f"cubes: expected surface_cubes(sdf), {count} of them, got {len(cubes)} others")
-        index = torch.cumsum(real, 0) - 1 if pad else torch.arange(len(cells), device=device, dtype=torch.int64)
-        rows = torch.where(real, index, -1) if pad else index
+        rows = torch.where(real, torch.cumsum(real, 0) - 1, -1)
     cells, rows = cells.to(torch.int32), rows.to(torch.int32)
     resolved, counts = torch.empty_like(cells), torch.empty_like(cells)
     slot = torch.empty(sdf.numel(), dtype=torch.int32, device=device)
@@ -242,8 +229,8 @@ class _DualVertices(torch.autograd.Function):
         inputs = [None if v is None else v.detach().contiguous() for v in (deformation, alpha, beta)]
         arguments = [cube, group, *_DualVertices.arguments(t, padded, inputs, scale), vertices]
         launch(kernels.dual_vertex_kernel, len(cube), arguments, device)
-        ctx.topology, ctx.scale, ctx.given = topology, scale, [v is not None for v in (deformation, alpha, beta)]
-        ctx.save_for_backward(padded, sdf, *(v for v in (deformation, alpha, beta) if v is not None))
+        ctx.topology, ctx.scale = topology, scale
+        ctx.save_for_backward(padded, sdf, deformation, alpha, beta)
         return vertices
 
     @staticmethod
@@ -259,9 +246,8 @@ class _DualVertices(torch.autograd.Function):
         from reli3d.kernels import flexicubes_adjoint
 
         t, device = ctx.topology, g_vertices.device
-        padded, sdf, *rest = ctx.saved_tensors
-        rest = iter(rest)
-        inputs = [next(rest).contiguous() if given else None for given in ctx.given]
+        padded, sdf, *given = ctx.saved_tensors
+        inputs = [None if v is None else v.contiguous() for v in given]
         n = len(t.cells)
         g_sdf, g_alpha, g_beta = (torch.zeros(n, width, device=device, dtype=torch.float32) for width in (8, 8, 12))
         g_shift = torch.zeros(n, 8, 3, device=device, dtype=torch.float32)

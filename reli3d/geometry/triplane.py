@@ -32,18 +32,10 @@ class _SampleTriplane(torch.autograd.Function):
         batch, _, channels, height, width = planes.shape
         n, blocks = points.shape[1], -(-channels // BLOCK_CHANNELS)
         order = edges = points.new_empty(0, dtype=torch.int32)
-        scattered = (
-            not planes.is_cuda
-            and height * width * blocks * BLOCK_CHANNELS > CACHED_FLOATS
-            and not _is_walk(points, max(height, width))
-        )
-        by_rows = (
-            scattered
-            and planes.dtype == torch.float32
-            and planes.is_contiguous()
-            and not ctx.needs_input_grad[1]
-            and planes.numel() < 2**31
-        )
+        large = not planes.is_cuda and height * width * blocks * BLOCK_CHANNELS > CACHED_FLOATS
+        scattered = large and not _is_walk(points, max(height, width))
+        channel_first = planes.dtype == torch.float32 and planes.is_contiguous() and planes.numel() < 2**31
+        by_rows = scattered and channel_first and not ctx.needs_input_grad[1]
         if ctx.needs_input_grad[0] or scattered:
             order, edges = _by_cell_row(points, height, width)
         features = points.new_empty(batch, n, 3, blocks * BLOCK_CHANNELS)
@@ -52,21 +44,12 @@ class _SampleTriplane(torch.autograd.Function):
         out, sizes = features.view(-1, BLOCK_CHANNELS), sizes_of(n, height, width, blocks)
         if by_rows:
             scratch = points.new_empty(batch * 3 * BANDS * 2 * (width + 2) * blocks, BLOCK_CHANNELS)
-            launch(
-                kernels.sample_rows_kernel,
-                batch * 3 * BANDS,
-                [packed.view(-1), *inputs, edges.view(-1), sizes, channels, BANDS, scratch, out],
-                planes.device,
-                slice_min=1,
-            )
+            args = [packed.view(-1), *inputs, edges.view(-1), sizes, channels, BANDS, scratch, out]
+            launch(kernels.sample_rows_kernel, batch * 3 * BANDS, args, planes.device, slice_min=1)
         else:
             split = blocks if planes.is_cuda else 1  # neighboring GPU threads read neighboring blocks
-            launch(
-                kernels.sample_kernel,
-                batch * n * 3 * split,
-                [packed.view(-1, BLOCK_CHANNELS), *inputs, sizes, split, out],
-                planes.device,
-            )
+            args = [packed.view(-1, BLOCK_CHANNELS), *inputs, sizes, split, out]
+            launch(kernels.sample_kernel, batch * n * 3 * split, args, planes.device)
         sorted_points = (order, edges) if ctx.needs_input_grad[0] else (None, None)
         source = planes if all(ctx.needs_input_grad) else None  # makes a second derivative an error: packed is a copy
         ctx.save_for_backward(points, packed if ctx.needs_input_grad[1] else None, *sorted_points, source)
@@ -83,7 +66,12 @@ class _SampleTriplane(torch.autograd.Function):
             g = torch.nn.functional.pad(g, (0, -channels % BLOCK_CHANNELS))
         g = g.contiguous()
         g_planes = _planes_adjoint(points, g, order, edges, ctx.shape).to(ctx.dtype) if order is not None else None
-        g_points = _points_adjoint(packed, points, g) if packed is not None else None
+        if packed is None:
+            return g_planes, None
+        at, g_points = points.view(-1, 3), torch.empty_like(points)
+        sizes = sizes_of(points.shape[1], *ctx.shape[3:], packed.shape[-1] // BLOCK_CHANNELS)
+        args = [packed.view(-1, BLOCK_CHANNELS), at, g.view(-1, BLOCK_CHANNELS), sizes, g_points.view(-1, 3)]
+        launch(kernels.points_adjoint_kernel, len(at), args, points.device)
         return g_planes, g_points
 
 
@@ -117,12 +105,8 @@ def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tenso
     slabs, n, segments = points.shape[0] * 3, points.shape[1], _segments(points, width)
     bins = segments * SEGMENT if points.is_cuda else 2**16 // (height + 2)
     keys = torch.empty(slabs, n, dtype=torch.int32, device=points.device)
-    launch(
-        kernels.cell_key_kernel,
-        slabs * n,
-        [points.view(-1, 3), sizes_of(n, height, width, 0), bins, keys.view(-1)],
-        points.device,
-    )
+    args = [points.view(-1, 3), sizes_of(n, height, width, 0), bins, keys.view(-1)]
+    launch(kernels.cell_key_kernel, slabs * n, args, points.device)
     groups = (height + 1) * segments
     edges = keys.new_zeros(slabs, groups + 1)
     if points.is_cuda:
@@ -142,25 +126,6 @@ def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tenso
     return order, edges
 
 
-def _points_adjoint(packed: Tensor, points: Tensor, g: Tensor) -> Tensor:
-    batch, n, _ = points.shape
-    _, _, height, width, channels = packed.shape
-    g_points = torch.empty_like(points)
-    launch(
-        kernels.points_adjoint_kernel,
-        batch * n,
-        [
-            packed.view(-1, BLOCK_CHANNELS),
-            points.view(-1, 3),
-            g.view(-1, BLOCK_CHANNELS),
-            sizes_of(n, height, width, channels // BLOCK_CHANNELS),
-            g_points.view(-1, 3),
-        ],
-        points.device,
-    )
-    return g_points
-
-
 def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, shape: torch.Size) -> Tensor:
     batch, n, _ = points.shape
     channels, height, width = shape[2:]
@@ -168,25 +133,12 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
     g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK_CHANNELS, device=points.device, dtype=torch.float32)
     split, sizes = 1 if points.device.type == "cpu" else blocks, sizes_of(n, height, width, blocks)
     segments = _segments(points, width)
+    inputs = [points.view(-1, 3), g.view(-1, BLOCK_CHANNELS), order.view(-1), edges.view(-1), sizes, segments]
+    out = g_planes.view(-1, BLOCK_CHANNELS)
     for row_parity, parity in itertools.product((0, 1), (0, 1)):
-        launch(
-            kernels.planes_adjoint_kernel,
-            batch * 3 * ((height + 2 - row_parity) // 2) * ((segments + 1 - parity) // 2) * split,
-            [
-                points.view(-1, 3),
-                g.view(-1, BLOCK_CHANNELS),
-                order.view(-1),
-                edges.view(-1),
-                sizes,
-                segments,
-                row_parity,
-                parity,
-                split,
-                g_planes.view(-1, BLOCK_CHANNELS),
-            ],
-            points.device,
-            slice_min=ROWS_MIN,
-        )
+        count = batch * 3 * ((height + 2 - row_parity) // 2) * ((segments + 1 - parity) // 2) * split
+        args = [*inputs, row_parity, parity, split, out]
+        launch(kernels.planes_adjoint_kernel, count, args, points.device, slice_min=ROWS_MIN)
     return g_planes[..., :channels].permute(0, 1, 4, 2, 3)
 
 

@@ -83,12 +83,8 @@ def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
         longest=MAX_CHART_LENGTH * texture_size,
         sliver=4.0e-6 * texture_size,
     )
-    uv = _pack(charts, texture_size, guard)
-    flat = _area(uv) <= 0.0
-    while flat.any():  # rounding to float32 took a face's area: it moves to the slivers
-        charts.chart[flat] = -1
-        uv = _pack(charts, texture_size, guard)
-        flat = _area(uv) <= 0.0
+    while (flat := _area(uv := _pack(charts, texture_size, guard)) <= 0.0).any():
+        charts.chart[flat] = -1  # rounding to float32 took a face's area: it moves to the slivers
     return _joined(mesh, source_faces, charts, uv)
 
 

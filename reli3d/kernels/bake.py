@@ -133,16 +133,10 @@ def texels_kernel(
                         # an exact 0 would lock the texel; it is on the border, any face of it will do
                         distance[y, x] = wp.max(d, 1.0e-12)
                         face[y, x] = f
-                        w1 = wp.float32(0.0)
-                        w2 = wp.float32(0.0)
-                        if k == 0:
-                            w1 = t
-                        elif k == 1:
-                            w1 = 1.0 - t
-                            w2 = t
-                        else:
-                            w2 = 1.0 - t
-                        bary[y, x] = wp.vec2(w1, w2)
+                        w = wp.vec3()
+                        w[k] = 1.0 - t
+                        w[(k + 1) % 3] = t
+                        bary[y, x] = wp.vec2(w[1], w[2])
 
 
 @wp.kernel
@@ -161,15 +155,10 @@ def nearest_row_kernel(
     x0 = i * strip
     x1 = wp.min(x0 + strip, valid.shape[1])
     for x in range(x0, x1):
-        row[0, x] = wp.int32(-NO_SITE_ROWS)
-        if valid[0, x] != wp.uint8(0):
-            row[0, x] = 0
+        row[0, x] = wp.where(valid[0, x] != wp.uint8(0), 0, wp.int32(-NO_SITE_ROWS))
     for y in range(1, height):
         for x in range(x0, x1):
-            if valid[y, x] != wp.uint8(0):
-                row[y, x] = y
-            else:
-                row[y, x] = row[y - 1, x]
+            row[y, x] = wp.where(valid[y, x] != wp.uint8(0), y, row[y - 1, x])
     for s in range(1, height):
         y = height - 1 - s
         for x in range(x0, x1):

@@ -35,17 +35,11 @@ def overlap(corners: wp.array2d[wp.vec2], i: int, j: int, slack: float) -> bool:
     b0 = corners[j, 0]
     b1 = corners[j, 1]
     b2 = corners[j, 2]
-    if separates(a0, a1, b0, b1, b2, slack):
+    if separates(a0, a1, b0, b1, b2, slack) or separates(b0, b1, a0, a1, a2, slack):
         return False
-    if separates(a1, a2, b0, b1, b2, slack):
+    if separates(a1, a2, b0, b1, b2, slack) or separates(b1, b2, a0, a1, a2, slack):
         return False
-    if separates(a2, a0, b0, b1, b2, slack):
-        return False
-    if separates(b0, b1, a0, a1, a2, slack):
-        return False
-    if separates(b1, b2, a0, a1, a2, slack):
-        return False
-    return not separates(b2, b0, a0, a1, a2, slack)
+    return not (separates(a2, a0, b0, b1, b2, slack) or separates(b2, b0, a0, a1, a2, slack))
 
 
 @wp.kernel
@@ -193,36 +187,25 @@ def pack_serial_kernel(
         best_x = wp.int32(0)
         turned = wp.int32(0)
         for x in range(size - width + 1):
-            y = wp.int32(0)
-            c = wp.int32(0)
-            while c < width:
-                y = wp.max(y, horizon[x + c] - bottom[base + c])
-                c += 1
-                if y >= best:
-                    c = width
-            if y < best:
-                best = y
-                best_x = x
-                turned = 0
-            y = wp.int32(0)
-            c = wp.int32(0)
-            while c < width:
-                y = wp.max(y, horizon[x + c] - (tall - top[base + width - 1 - c]))
-                c += 1
-                if y >= best:
-                    c = width
-            if y < best:
-                best = y
-                best_x = x
-                turned = 1
+            for turn in range(2):
+                y = wp.int32(0)
+                c = wp.int32(0)
+                while c < width and y < best:
+                    if turn == 0:
+                        y = wp.max(y, horizon[x + c] - bottom[base + c])
+                    else:
+                        y = wp.max(y, horizon[x + c] - (tall - top[base + width - 1 - c]))
+                    c += 1
+                if y < best:
+                    best = y
+                    best_x = x
+                    turned = turn
         place[i, 0] = best_x
         place[i, 1] = best
         place[i, 2] = turned
         place[i, 3] = tall
         for c in range(width):
-            t = top[base + c]
-            if turned == 1:
-                t = tall - bottom[base + width - 1 - c]
+            t = wp.where(turned == 1, tall - bottom[base + width - 1 - c], top[base + c])
             horizon[best_x + c] = wp.max(horizon[best_x + c], best + t)
             highest = wp.max(highest, best + t)
     height[0] = highest

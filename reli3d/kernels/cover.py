@@ -6,7 +6,7 @@ The grid ``(X, Y, Z)`` fills the cube [-radius, radius]^3, its outermost points 
 import warp as wp
 
 from reli3d.kernels.bilinear import look_up
-from reli3d.kernels.grid import between_points
+from reli3d.kernels.grid import between_points, trilinear
 from reli3d.kernels.math import cube_range
 from reli3d.kernels.projection import project_point
 
@@ -19,30 +19,12 @@ INSET_PIXELS = wp.constant(1.0)  # least distance to the silhouette's edge, whos
 
 
 @wp.func
-def sdf_at(sdf: wp.array3d[float], cell: wp.vec3) -> float:
-    """Trilinear interpolation at ``cell``, a point in units of cells, clamped to the grid."""
-    x = between_points(cell[0], sdf.shape[0])
-    y = between_points(cell[1], sdf.shape[1])
-    z = between_points(cell[2], sdf.shape[2])
-    i = int(x[0])
-    j = int(y[0])
-    k = int(z[0])
-    v00 = wp.lerp(sdf[i, j, k], sdf[i, j, k + 1], z[1])
-    v01 = wp.lerp(sdf[i, j + 1, k], sdf[i, j + 1, k + 1], z[1])
-    v10 = wp.lerp(sdf[i + 1, j, k], sdf[i + 1, j, k + 1], z[1])
-    v11 = wp.lerp(sdf[i + 1, j + 1, k], sdf[i + 1, j + 1, k + 1], z[1])
-    return wp.lerp(wp.lerp(v00, v01, y[1]), wp.lerp(v10, v11, y[1]), x[1])
-
-
-@wp.func
 def out_of_block(cell: wp.vec3, along: wp.vec3, block: wp.vec3i) -> float:
     """Ray parameter at which the ray ``cell + t * along``, in units of cells, leaves ``block``."""
     far = wp.float32(3.0e38)
     for axis in range(3):
-        side = float(block[axis] * BLOCK_CELLS)
-        if along[axis] > 0.0:
-            side += float(BLOCK_CELLS)
         if along[axis] != 0.0:
+            side = float((block[axis] + wp.where(along[axis] > 0.0, 1, 0)) * BLOCK_CELLS)
             far = wp.min(far, (side - cell[axis]) / along[axis])
     return far
 
@@ -50,7 +32,7 @@ def out_of_block(cell: wp.vec3, along: wp.vec3, block: wp.vec3i) -> float:
 @wp.kernel
 def residual_kernel(
     start: int,
-    sdf: wp.array3d[float],
+    sdf: wp.array4d[float],  # of one channel
     lowest: wp.array3d[float],  # of each block of BLOCK_CELLS cells a side, border included
     distance: wp.array3d[float],
     c2w: wp.array[wp.mat44],
@@ -94,7 +76,10 @@ def residual_kernel(
                 wp.clamp(int(cell[2]) // BLOCK_CELLS, 0, lowest.shape[2] - 1),
             )
             if lowest[block[0], block[1], block[2]] < least:
-                least = wp.min(least, sdf_at(sdf, cell))
+                x_at = between_points(cell[0], sdf.shape[0])
+                y_at = between_points(cell[1], sdf.shape[1])
+                z_at = between_points(cell[2], sdf.shape[2])
+                least = wp.min(least, trilinear(sdf, x_at, y_at, z_at, 0))
             else:  # no sample in this block can lower the minimum
                 end = t + out_of_block(cell, wp.cw_mul(direction, scale), block) - step
                 while t < end:

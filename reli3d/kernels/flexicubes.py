@@ -5,10 +5,6 @@ The grid has ``nx * ny * nz`` vertices; vertex (i, j, k) has the index ``(i * ny
 of its lowest corner, so there is no cube at the last index of an axis.  Inside is sdf < 0.  If ``pad`` is 1, the grid
 was padded by one layer of vertices with a positive value, which lie at the positions of the border vertices.  The cubes
 of this layer have zero thickness and cap the surface flat at the box.
-
-Dual marching cubes is ambiguous where two cubes share a face with four crossed edges (cases C16 and C19 of Wenger 2013,
-Isosurfaces): four quads would meet in one edge and make the surface non-manifold.  :func:`resolve_kernel` changes these
-cases.
 """
 
 import warp as wp
@@ -79,39 +75,35 @@ def corner_index(cell: int, corner: int, ny: int, nz: int) -> int:
 
 @wp.func
 def inside_bit(sdf: wp.array[float], index: int) -> int:
-    if sdf[index] < 0.0:
-        return 1
-    return 0
+    return wp.where(sdf[index] < 0.0, 1, 0)
 
 
 @wp.func
-def grid_position(at: wp.vec3i, grid: Grid) -> wp.vec3:
-    """Position of a grid vertex in [-0.5, 0.5]^3 plus deformation."""
-    cubes = grid.cubes
-    pad = grid.pad
-    i = wp.clamp(at[0] - pad, 0, cubes[0])
-    j = wp.clamp(at[1] - pad, 0, cubes[1])
-    k = wp.clamp(at[2] - pad, 0, cubes[2])
-    p = wp.vec3(float(i) / float(cubes[0]) - 0.5, float(j) / float(cubes[1]) - 0.5, float(k) / float(cubes[2]) - 0.5)
-    if grid.shift.shape[0] > 0:
-        p += grid.shift[(i * (cubes[1] + 1) + j) * (cubes[2] + 1) + k]
-    return p
+def shift_of(vertex: wp.vec3i, grid: Grid) -> wp.vec3:
+    """Deformation of an unpadded grid vertex."""
+    if grid.shift.shape[0] == 0:
+        return wp.vec3()
+    return grid.shift[(vertex[0] * (grid.cubes[1] + 1) + vertex[1]) * (grid.cubes[2] + 1) + vertex[2]]
 
 
 @wp.func
-def exact_position(at: wp.vec3i, grid: Grid) -> wp.vec3d:
-    """:func:`grid_position` in float64, for differences."""
-    cubes = grid.cubes
-    pad = grid.pad
-    i = wp.clamp(at[0] - pad, 0, cubes[0])
-    j = wp.clamp(at[1] - pad, 0, cubes[1])
-    k = wp.clamp(at[2] - pad, 0, cubes[2])
-    p = wp.vec3d(
-        wp.float64(i) / wp.float64(cubes[0]), wp.float64(j) / wp.float64(cubes[1]), wp.float64(k) / wp.float64(cubes[2])
-    )
-    if grid.shift.shape[0] > 0:
-        p += wp.vec3d(grid.shift[(i * (cubes[1] + 1) + j) * (cubes[2] + 1) + k])
-    return p
+def corner_of(at: wp.vec3i, corner: int, grid: Grid) -> wp.vec3i:
+    """Unpadded grid vertex at a corner of the cube whose lowest padded vertex is ``at``."""
+    v = at + wp.vec3i(corner & 1, corner >> 1 & 1, corner >> 2) - wp.vec3i(grid.pad)
+    return wp.min(wp.max(v, wp.vec3i()), grid.cubes)
+
+
+@wp.func
+def grid_position(v: wp.vec3i, grid: Grid) -> wp.vec3:
+    """Position of an unpadded grid vertex in [-0.5, 0.5]^3 plus deformation."""
+    p = wp.cw_div(wp.vec3(v), wp.vec3(grid.cubes)) - wp.vec3(0.5)
+    return p + shift_of(v, grid)
+
+
+@wp.func
+def exact_position(v: wp.vec3i, grid: Grid) -> wp.vec3d:
+    """:func:`grid_position` plus 0.5 in float64, for differences."""
+    return wp.cw_div(wp.vec3d(v), wp.vec3d(grid.cubes)) + wp.vec3d(shift_of(v, grid))
 
 
 @wp.func
@@ -218,11 +210,7 @@ def resolve_kernel(
     if face >= 0:
         axis = face // 2
         at = split_index(cell, ny, nz)
-        step = wp.int32(1)
-        if axis == 1:
-            step = nz
-        if axis == 0:
-            step = ny * nz
+        step = wp.where(axis == 2, 1, wp.where(axis == 1, nz, ny * nz))
         if face % 2 == 1:
             if neighbor[int(codes[cell + step])] == face - 1:
                 code = 255 - code
@@ -268,8 +256,8 @@ def dual_vertex_kernel(
             sdf_a = grid.sdf[corner_index(cell, a, grid.ny, grid.nz)]
             sdf_b = grid.sdf[corner_index(cell, b, grid.ny, grid.nz)]
             t = float(crossing_fractions(alpha_a, sdf_a, alpha_b, sdf_b)[0])
-            x_a = grid_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), grid)
-            x_b = grid_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), grid)
+            x_a = grid_position(corner_of(at, a, grid), grid)
+            x_b = grid_position(corner_of(at, b, grid), grid)
             if not (alpha_a > 0.0 and alpha_b > 0.0 and beta_e > 0.0):
                 beta_e = wp.nan
             point += (x_a + t * (x_b - x_a)) * beta_e
@@ -311,14 +299,8 @@ def quad_kernel(
     outward = grid.sdf[v] < 0.0
     for corner in range(4):
         # the order around the edge is 0, 1, 3, 2; seen from the other end 2, 3, 1, 0
-        turn = corner
-        if outward:
-            turn = 3 - corner
-        n = turn
-        if turn == 2:
-            n = 3
-        if turn == 3:
-            n = 2
+        turn = wp.where(outward, 3 - corner, corner)
+        n = turn ^ (turn >> 1)
         cell = lowest - first * (1 - (n >> 1)) - second * (1 - (n & 1))
         s = surface.slot[cell]
         edge = surface.resolved[s] * 12 + tables.around[axis * 4 + n]

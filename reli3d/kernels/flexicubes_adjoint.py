@@ -9,6 +9,7 @@ from reli3d.kernels.flexicubes import (
     Tables,
     Weights,
     corner_index,
+    corner_of,
     crossing_fractions,
     exact_position,
     split_index,
@@ -54,8 +55,8 @@ def dual_vertex_adjoint_kernel(
                     weight(weights.alpha, row, 8, b),
                     grid.sdf[corner_index(cell, b, grid.ny, grid.nz)],
                 )
-                x_a = exact_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), grid)
-                x_b = exact_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), grid)
+                x_a = exact_position(corner_of(at, a, grid), grid)
+                x_b = exact_position(corner_of(at, b, grid), grid)
                 beta_e = wp.float64(weight(weights.beta, row, 12, e))
                 mean += (x_a * fraction[1] + x_b * fraction[0]) * beta_e
                 total += beta_e
@@ -70,8 +71,8 @@ def dual_vertex_adjoint_kernel(
                 sdf_a = grid.sdf[corner_index(cell, a, grid.ny, grid.nz)]
                 sdf_b = grid.sdf[corner_index(cell, b, grid.ny, grid.nz)]
                 fraction = crossing_fractions(float(alpha_a), sdf_a, float(alpha_b), sdf_b)
-                x_a = exact_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), grid)
-                x_b = exact_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), grid)
+                x_a = exact_position(corner_of(at, a, grid), grid)
+                x_b = exact_position(corner_of(at, b, grid), grid)
                 g_beta[s * 12 + e] = float(wp.dot(x_a * fraction[1] + x_b * fraction[0] - mean, g))
                 g_point = g * wp.float64(weight(weights.beta, row, 12, e))
                 g_t = wp.dot(x_b - x_a, g_point)

@@ -16,6 +16,19 @@ def between_points(x: float, count: int) -> wp.vec2:
     return wp.vec2(low, u - low)
 
 
+@wp.func
+def trilinear(grid: wp.array4d[float], x: wp.vec2, y: wp.vec2, z: wp.vec2, c: int) -> float:
+    """Value of channel ``c`` at the place that :func:`between_points` gives along each axis."""
+    i = int(x[0])
+    j = int(y[0])
+    k = int(z[0])
+    v00 = wp.lerp(grid[i, j, k, c], grid[i, j, k + 1, c], z[1])
+    v01 = wp.lerp(grid[i, j + 1, k, c], grid[i, j + 1, k + 1, c], z[1])
+    v10 = wp.lerp(grid[i + 1, j, k, c], grid[i + 1, j, k + 1, c], z[1])
+    v11 = wp.lerp(grid[i + 1, j + 1, k, c], grid[i + 1, j + 1, k + 1, c], z[1])
+    return wp.lerp(wp.lerp(v00, v01, y[1]), wp.lerp(v10, v11, y[1]), x[1])
+
+
 @wp.kernel
 def sample_grid_kernel(
     start: int,
@@ -28,21 +41,8 @@ def sample_grid_kernel(
     x = between_points(0.5 * (p[0] + 1.0) * float(grid.shape[0] - 1), grid.shape[0])
     y = between_points(0.5 * (p[1] + 1.0) * float(grid.shape[1] - 1), grid.shape[1])
     z = between_points(0.5 * (p[2] + 1.0) * float(grid.shape[2] - 1), grid.shape[2])
-    i = int(x[0])
-    j = int(y[0])
-    k = int(z[0])
     for c in range(grid.shape[3]):
-        low = wp.lerp(
-            wp.lerp(grid[i, j, k, c], grid[i, j, k + 1, c], z[1]),
-            wp.lerp(grid[i, j + 1, k, c], grid[i, j + 1, k + 1, c], z[1]),
-            y[1],
-        )
-        high = wp.lerp(
-            wp.lerp(grid[i + 1, j, k, c], grid[i + 1, j, k + 1, c], z[1]),
-            wp.lerp(grid[i + 1, j + 1, k, c], grid[i + 1, j + 1, k + 1, c], z[1]),
-            y[1],
-        )
-        features[n, c] = wp.lerp(low, high, x[1])
+        features[n, c] = trilinear(grid, x, y, z, c)
 
 
 @wp.func

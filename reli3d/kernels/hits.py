@@ -22,10 +22,7 @@ HALF = wp.constant(wp.float64(0.5))
 @wp.func
 def wrap(k: int, size: int) -> int:
     """``k`` modulo ``size``, never negative."""
-    m = k % size
-    if m < 0:
-        m = m + size
-    return m
+    return (k % size + size) % size
 
 
 @wp.kernel

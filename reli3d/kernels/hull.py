@@ -9,6 +9,7 @@ import warp as wp
 
 from reli3d.kernels.bilinear import look_up
 from reli3d.kernels.envelope import NO_SITE_ROWS, lower_envelope
+from reli3d.kernels.projection import project_point
 
 wp.set_module_options(
     # functions that several kernels call: a call copies the arrays' shapes and strides
@@ -31,15 +32,10 @@ def distance_in_view(
     point: wp.vec3, view: int, distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4]
 ) -> float:
     """Silhouette distance where a point projects, times the size of a pixel at its depth."""
-    m = c2w[view]
-    away = point - wp.vec3(m[0, 3], m[1, 3], m[2, 3])
-    right = m[0, 0] * away[0] + m[1, 0] * away[1] + m[2, 0] * away[2]
-    up = m[0, 1] * away[0] + m[1, 1] * away[1] + m[2, 1] * away[2]
-    depth = -(m[0, 2] * away[0] + m[1, 2] * away[1] + m[2, 2] * away[2])
-    if depth > DEPTH_MIN:  # False for NaN too
-        k = intrinsics[view]
-        value = look_up(distance, view, k[2] + k[0] * right / depth, k[3] - k[1] * up / depth)
-        return value * depth * 2.0 / (k[0] + k[1])
+    k = intrinsics[view]
+    q = project_point(point, c2w[view], k)
+    if q[2] > DEPTH_MIN:  # False for NaN too
+        return look_up(distance, view, q[0], q[1]) * q[2] * 2.0 / (k[0] + k[1])
     return BEHIND
 
 
@@ -99,6 +95,32 @@ def mirror_residual_kernel(
     residual[plane, ray] = wp.max(-best, 0.0)
 
 
+@wp.func
+def march(
+    o: wp.vec3,
+    d: wp.vec3,
+    begin: float,
+    end: float,
+    least_step: float,
+    distance: wp.array3d[float],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+):
+    """Whether sphere tracing of ``o + t d`` from ``begin`` to ``end`` hits the hull, and t there or closest to it."""
+    sign = wp.where(end < begin, -1.0, 1.0)
+    unit = 1.0 / wp.length(d)
+    t = wp.float32(begin)
+    nearest = wp.float32(begin)
+    best = wp.float32(BEHIND)
+    while sign * (end - t) >= 0.0 and best < -REACHED:
+        h = distance_to_hull(o + d * t, distance, c2w, intrinsics, -BEHIND)
+        if h > best:
+            best = h
+            nearest = t
+        t += sign * wp.max(wp.clamp(-h * STEP_FACTOR, STEP_MIN, STEP_MAX) * unit, least_step)
+    return best >= -REACHED, nearest
+
+
 @wp.kernel
 def hull_span_kernel(
     start: int,
@@ -119,42 +141,13 @@ def hull_span_kernel(
     half = wp.sqrt(wp.max(b * b - a * (wp.dot(o, o) - radius * radius), 0.0)) / a
     low = -b / a - half
     high = -b / a + half
-    unit = 1.0 / wp.sqrt(a)
-    nearest = wp.float32(low)  # closest approach to the hull, the result if the ray misses it
-    best = wp.float32(BEHIND)
-    first = wp.float32(low)
-    inside = wp.bool(False)
-    while first <= high and not inside:
-        h = distance_to_hull(o + d * first, distance, c2w, intrinsics, -BEHIND)
-        if h > best:
-            best = h
-            nearest = first
-        if h >= -REACHED:
-            inside = True
-        else:
-            first += wp.max(wp.clamp(-h * STEP_FACTOR, STEP_MIN, STEP_MAX) * unit, LEAST_STEP * high)
-    if not inside:
-        span[i] = wp.vec2(nearest, nearest)
-        return
-    last = wp.float32(high)
-    inside = wp.bool(False)
-    while last > first and not inside:
-        h = distance_to_hull(o + d * last, distance, c2w, intrinsics, -BEHIND)
-        if h >= -REACHED:
-            inside = True
-        else:
-            last -= wp.max(wp.clamp(-h * STEP_FACTOR, STEP_MIN, STEP_MAX) * unit, LEAST_STEP * high)
-    span[i] = wp.vec2(first, wp.max(first, last))
-
-
-@wp.func
-def crosses(mask: wp.array3d[float], view: int, y: int, x: int) -> bool:
-    """Whether the contour runs through a cell."""
-    count = wp.int32(0)
-    for k in range(4):
-        if mask[view, y + k // 2, x + k % 2] >= 0.5:
-            count += 1
-    return count > 0 and count < 4
+    hit, first = march(o, d, low, high, LEAST_STEP * high, distance, c2w, intrinsics)
+    last = wp.float32(first)  # of a ray that misses the hull both are its closest approach
+    if hit:
+        again, back = march(o, d, high, first, LEAST_STEP * high, distance, c2w, intrinsics)
+        if again:
+            last = back
+    span[i] = wp.vec2(first, last)
 
 
 @wp.func
@@ -173,7 +166,7 @@ def crossing(a: float, b: float) -> float:
 
 @wp.func
 def squared_to_contour(mask: wp.array3d[float], view: int, y: int, x: int, p: wp.vec2) -> float:
-    """Squared distance of ``p`` (column, row in pixel centers) to the contour inside cell (y, x), which it crosses."""
+    """Squared distance of ``p`` (column, row in pixel centers) to the contour inside cell (y, x); inf without any."""
     m00 = mask[view, y, x]
     m01 = mask[view, y, x + 1]
     m10 = mask[view, y + 1, x]
@@ -183,18 +176,12 @@ def squared_to_contour(mask: wp.array3d[float], view: int, y: int, x: int, p: wp
     bottom = (m10 >= 0.5) != (m11 >= 0.5)
     left = (m00 >= 0.5) != (m10 >= 0.5)
     right = (m01 >= 0.5) != (m11 >= 0.5)
-    t = wp.vec2()
-    b = wp.vec2()
-    l = wp.vec2()
-    r = wp.vec2()
-    if top:
-        t = wp.vec2(crossing(m00, m01), 0.0)
-    if bottom:
-        b = wp.vec2(crossing(m10, m11), 1.0)
-    if left:
-        l = wp.vec2(0.0, crossing(m00, m10))
-    if right:
-        r = wp.vec2(1.0, crossing(m01, m11))
+    if not (top or bottom or left or right):
+        return wp.inf
+    t = wp.vec2(crossing(m00, m01), 0.0)  # undefined and unused where the contour does not cross a side
+    b = wp.vec2(crossing(m10, m11), 1.0)
+    l = wp.vec2(0.0, crossing(m00, m10))
+    r = wp.vec2(1.0, crossing(m01, m11))
     if top and bottom and left and right:
         # saddle: the corners with the sign of the center are joined, the other two are cut off
         if (0.25 * (m00 + m01 + m10 + m11) >= 0.5) == (m00 >= 0.5):
@@ -271,10 +258,7 @@ def row_kernel(
     for x in range(row.shape[2]):
         while k < top and begin[view, y, k + 1] < float(x):
             k += 1
-        if top < 0:
-            nearest[view, y, x] = -1
-        else:
-            nearest[view, y, x] = apex[view, y, k]
+        nearest[view, y, x] = wp.where(top < 0, -1, apex[view, y, k])
 
 
 @wp.kernel
@@ -324,10 +308,6 @@ def mask_distance_kernel(
         neighbors = -1  # no cell
     for v in range(cell_y - 1, cell_y + neighbors):
         for u in range(cell_x - 1, cell_x + neighbors):
-            inner = v >= 0 and v < height - 1 and u >= 0 and u < width - 1
-            if inner and crosses(mask, view, v, u):
+            if v >= 0 and v < height - 1 and u >= 0 and u < width - 1:
                 best = wp.min(best, squared_to_contour(mask, view, v, u, p))
-    if mask[view, y, x] >= 0.5:
-        distance[view, y, x] = wp.sqrt(best)
-    else:
-        distance[view, y, x] = -wp.sqrt(best)
+    distance[view, y, x] = wp.where(mask[view, y, x] >= 0.5, wp.sqrt(best), -wp.sqrt(best))

@@ -50,9 +50,7 @@ def tangent_frame(n: wp.vec3) -> wp.mat33:
 
     Duff et al. 2017, Building an Orthonormal Basis, Revisited: no branch on the direction, continuous but at n.z = 0-.
     """
-    s = wp.float32(1.0)
-    if n[2] < 0.0:
-        s = -1.0
+    s = wp.where(n[2] < 0.0, -1.0, 1.0)
     a = -1.0 / (s + n[2])
     b = n[0] * n[1] * a
     return wp.mat33(1.0 + s * n[0] * n[0] * a, s * b, -s * n[0], b, s + n[1] * n[1] * a, -n[1], n[0], n[1], n[2])

@@ -41,25 +41,16 @@ def gradient_noise(q: wp.vec3, seed: wp.uint32) -> wp.vec4:
     grad = wp.vec3()
     for i in range(2):
         hx = mix(seed ^ wp.uint32(int(cell[0]) + i))
-        wx = 1.0 - s[0]
-        dx = -ds[0]
-        if i == 1:
-            wx = s[0]
-            dx = ds[0]
+        wx = wp.where(i == 1, s[0], 1.0 - s[0])
+        dx = wp.where(i == 1, ds[0], -ds[0])
         for j in range(2):
             hy = mix(hx + wp.uint32(int(cell[1]) + j))
-            wy = 1.0 - s[1]
-            dy = -ds[1]
-            if j == 1:
-                wy = s[1]
-                dy = ds[1]
+            wy = wp.where(j == 1, s[1], 1.0 - s[1])
+            dy = wp.where(j == 1, ds[1], -ds[1])
             for k in range(2):
                 g = unpack(mix(hy + wp.uint32(int(cell[2]) + k)))
-                wz = 1.0 - s[2]
-                dz = -ds[2]
-                if k == 1:
-                    wz = s[2]
-                    dz = ds[2]
+                wz = wp.where(k == 1, s[2], 1.0 - s[2])
+                dz = wp.where(k == 1, ds[2], -ds[2])
                 d = wp.dot(g, f - wp.vec3(float(i), float(j), float(k)))
                 w = wx * wy * wz
                 value += w * d
@@ -86,9 +77,7 @@ def fbm_kernel(
     scale = wp.float32(1.0)
     for octave in range(octaves):
         n = gradient_noise(q * scale, mix(wp.uint32(seed * 64 + octave)))
-        sign = wp.float32(1.0)
-        if ridged == 1 and n[0] < 0.0:
-            sign = -1.0
+        sign = wp.where(ridged == 1 and n[0] < 0.0, -1.0, 1.0)
         total += sign * weight * n[0]
         grad += (sign * weight * scale) * wp.vec3(n[1], n[2], n[3])
         weight *= gain

@@ -42,10 +42,7 @@ def opposite(u: wp.vec2) -> wp.vec2:
     fraction u[1] of the cap's height goes to 1 - u[1] - 2^-24.  Exact for multiples of 2^-24, the grid of the random
     numbers, so the result is uniform too.
     """
-    turned = u[0] + 0.5
-    if u[0] >= 0.5:
-        turned = u[0] - 0.5
-    return wp.vec2(turned, (1.0 - TO_UNIT) - u[1])
+    return wp.vec2(u[0] + wp.where(u[0] < 0.5, 0.5, -0.5), (1.0 - TO_UNIT) - u[1])
 
 
 @wp.func

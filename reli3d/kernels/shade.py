@@ -127,9 +127,7 @@ def make_surface(plan: Plan, points: Points, i: int) -> Surface:
     ng = points.ng[i]
     wo = points.wo[i]
     pixel = points.pixel[i]
-    side = wp.float32(1.0)
-    if wp.dot(ng, wo) < 0.0:
-        side = -1.0
+    side = wp.where(wp.dot(ng, wo) < 0.0, -1.0, 1.0)
     surface = Surface()
     surface.frame = tangent_frame(adjust_normal(normal * side, wo))
     surface.ng = ng * side

@@ -11,8 +11,8 @@ import warp as wp
 from reli3d.kernels.bsdf import F0_DIELECTRIC, base_reflectance, coat_cosine, coat_schlick, eval_bsdf, schlick
 from reli3d.kernels.envmap import add_texels, lookup_envmap_uv
 from reli3d.kernels.math import CONTRACT, INLINE, INV_PI
-from reli3d.kernels.microfacet import ALPHA_MIN, Facet, smith_visibility
-from reli3d.kernels.shade import COS_VIEW_MIN, Light, Plan, Points, draw_sample, make_surface
+from reli3d.kernels.microfacet import ALPHA_MIN, smith_visibility
+from reli3d.kernels.shade import COS_VIEW_MIN, Draw, Light, Plan, Points, Surface, draw_sample, make_surface
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})
 
@@ -43,22 +43,19 @@ def schlick_turn(cos: float) -> float:
 
 @wp.func
 def add_sample_gradient(
-    total: SurfaceGradient,
-    facet: Facet,
-    wo: wp.vec3,
-    wi: wp.vec3,
-    base_color: wp.vec3,
-    alpha: float,
-    metallic: float,
-    conserving: int,
-    value: wp.vec3,
-    weight: wp.vec3,
+    total: SurfaceGradient, surface: Surface, d: Draw, conserving: int, value: wp.vec3, weight: wp.vec3
 ) -> SurfaceGradient:
     """``total`` plus the adjoint of ``dot(weight, value cos_i)``; ``value`` is the material's, ``weight`` holds the
     output's adjoint, light and factor."""
     out = total
     one = wp.vec3(1.0, 1.0, 1.0)
+    facet = d.facet
+    wo = surface.wo
+    wi = d.wi
     wm = facet.wm
+    base_color = surface.base_color
+    alpha = surface.alpha
+    metallic = surface.metallic
     f0 = base_reflectance(base_color, metallic)
     fresnel = schlick(f0, facet.cos_m)
     d_fresnel = schlick_d_f0(facet.cos_m)
@@ -139,25 +136,13 @@ def shade_adjoint_kernel(
                     if value[c] * scale * radiance[c] < top:
                         g_output[c] = g[c]
                 if material != 0:
-                    total = add_sample_gradient(
-                        total,
-                        d.facet,
-                        surface.wo,
-                        d.wi,
-                        surface.base_color,
-                        surface.alpha,
-                        surface.metallic,
-                        plan.conserving,
-                        value,
-                        wp.cw_mul(g_output, radiance) * d.factor,
-                    )
+                    weight = wp.cw_mul(g_output, radiance) * d.factor
+                    total = add_sample_gradient(total, surface, d, plan.conserving, value, weight)
                 if g_radiance.shape[0] != 0:
                     add_texels(g_radiance, d.uv, wp.cw_mul(g_output, value) * scale)
     if g_normal.shape[0] != 0:
         wo = points.wo[i]
-        side = wp.float32(1.0)
-        if wp.dot(points.ng[i], wo) < 0.0:
-            side = -1.0
+        side = wp.where(wp.dot(points.ng[i], wo) < 0.0, -1.0, 1.0)
         g_n = wp.transpose(surface.frame) * total.n
         facing = points.normal[i] * side
         cos_o = wp.dot(facing, wo)

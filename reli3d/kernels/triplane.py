@@ -32,13 +32,8 @@ def texel_position(point: wp.vec3, plane: int, sizes: Sizes) -> wp.vec2d:
 
     In float64: float32 would leave 1.5e-5 of a texel of 300, and a value of that part of what neighbors differ by.
     """
-    a = wp.float64(point[0])
-    b = wp.float64(point[1])
-    if plane == 1:
-        b = wp.float64(point[2])
-    if plane == 2:
-        a = wp.float64(point[1])
-        b = wp.float64(point[2])
+    a = wp.float64(point[plane // 2])
+    b = wp.float64(point[(plane + 3) // 2])
     width = wp.float64(sizes.width)
     height = wp.float64(sizes.height)
     return wp.vec2d(((a + ONE) * width - ONE) * HALF, ((b + ONE) * height - ONE) * HALF)
@@ -66,52 +61,16 @@ def texel(planes: wp.array[vec8], base: int, x: int, y: int, sizes: Sizes) -> ve
 
 
 @wp.func
-def sample_point(
-    planes: wp.array[vec8],
-    point: wp.vec3,
-    slab: int,  # batch * 3 + plane
-    sizes: Sizes,
-    first: int,
-    split: int,
-    features: wp.array[vec8],
-    out: int,
-):
-    """Every ``split``-th block of a point's features in one plane, to ``features`` from ``out`` on."""
-    height = sizes.height
-    width = sizes.width
-    blocks = sizes.blocks
-    at = texel_position(point, slab % 3, sizes)
-    if touches(at, sizes):
-        x = int(wp.floor(at[0]))
-        y = int(wp.floor(at[1]))
-        u = fraction(at[0], x)
-        v = fraction(at[1], y)
-        w00 = (1.0 - u) * (1.0 - v)
-        w01 = u * (1.0 - v)
-        w10 = (1.0 - u) * v
-        w11 = u * v
-        base = slab * height * width * blocks
-        if x >= 0 and y >= 0 and x + 1 < width and y + 1 < height:
-            top = base + (y * width + x) * blocks
-            bottom = top + width * blocks
-            for q in range(first, blocks, split):
-                features[out + q] = (
-                    planes[top + q] * w00
-                    + planes[top + blocks + q] * w01
-                    + planes[bottom + q] * w10
-                    + planes[bottom + blocks + q] * w11
-                )
-        else:
-            for q in range(first, blocks, split):
-                features[out + q] = (
-                    texel(planes, base + q, x, y, sizes) * w00
-                    + texel(planes, base + q, x + 1, y, sizes) * w01
-                    + texel(planes, base + q, x, y + 1, sizes) * w10
-                    + texel(planes, base + q, x + 1, y + 1, sizes) * w11
-                )
-    else:
-        for q in range(first, blocks, split):
-            features[out + q] = vec8()
+def corner_weights(u: float, v: float) -> wp.vec4:
+    """Weights of texels (y, x), (y, x + 1), (y + 1, x) and (y + 1, x + 1)."""
+    return wp.vec4((1.0 - u) * (1.0 - v), u * (1.0 - v), (1.0 - u) * v, u * v)
+
+
+@wp.func
+def blend(values: wp.array[vec8], top: int, bottom: int, step: int, w: wp.vec4) -> vec8:
+    """Weighted sum of two neighbors at ``top`` and two at ``bottom``."""
+    upper = values[top] * w[0] + values[top + step] * w[1]
+    return upper + values[bottom] * w[2] + values[bottom + step] * w[3]
 
 
 @wp.kernel
@@ -128,13 +87,35 @@ def sample_kernel(
     i = start + wp.tid()
     first = i % split
     i = i // split
+    width = sizes.width
+    blocks = sizes.blocks
     slab = i // sizes.points  # batch * 3 + plane
     point = i % sizes.points
     if order.shape[0] > 0:
         point = order[i]
     point += (slab // 3) * sizes.points
-    out = (point * 3 + slab % 3) * sizes.blocks
-    sample_point(planes, points[point], slab, sizes, first, split, features, out)
+    out = (point * 3 + slab % 3) * blocks
+    at = texel_position(points[point], slab % 3, sizes)
+    if not touches(at, sizes):
+        for q in range(first, blocks, split):
+            features[out + q] = vec8()
+        return
+    x = int(wp.floor(at[0]))
+    y = int(wp.floor(at[1]))
+    w = corner_weights(fraction(at[0], x), fraction(at[1], y))
+    base = slab * sizes.height * width * blocks
+    if x >= 0 and y >= 0 and x + 1 < width and y + 1 < sizes.height:
+        top = base + (y * width + x) * blocks
+        for q in range(first, blocks, split):
+            features[out + q] = blend(planes, top + q, top + width * blocks + q, blocks, w)
+    else:
+        for q in range(first, blocks, split):
+            features[out + q] = (
+                texel(planes, base + q, x, y, sizes) * w[0]
+                + texel(planes, base + q, x + 1, y, sizes) * w[1]
+                + texel(planes, base + q, x, y + 1, sizes) * w[2]
+                + texel(planes, base + q, x + 1, y + 1, sizes) * w[3]
+            )
 
 
 @wp.func
@@ -197,22 +178,11 @@ def sample_rows_kernel(
                 point = order[slab * sizes.points + k] + offset
                 at = texel_position(points[point], plane, sizes)
                 x = int(wp.floor(at[0]))
-                u = fraction(at[0], x)
-                v = fraction(at[1], row - 1)
-                w00 = (1.0 - u) * (1.0 - v)
-                w01 = u * (1.0 - v)
-                w10 = (1.0 - u) * v
-                w11 = u * v
-                one = top + (x + 1) * blocks
-                other = bottom + (x + 1) * blocks
+                w = corner_weights(fraction(at[0], x), fraction(at[1], row - 1))
+                left = (x + 1) * blocks
                 out = (point * 3 + plane) * blocks
                 for q in range(blocks):
-                    features[out + q] = (
-                        scratch[one + q] * w00
-                        + scratch[one + blocks + q] * w01
-                        + scratch[other + q] * w10
-                        + scratch[other + blocks + q] * w11
-                    )
+                    features[out + q] = blend(scratch, top + left + q, bottom + left + q, blocks, w)
     if band == bands - 1:
         for k in range(edges[slab * (height + 2) + height + 1], sizes.points):
             out = ((order[slab * sizes.points + k] + offset) * 3 + plane) * blocks

@@ -53,9 +53,7 @@ def view_numbers(
     value = look_up(image, view, q[0], q[1])
     eye = wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
     axis = wp.vec3(pose[0, 2], pose[1, 2], pose[2, 2])
-    inside = wp.float32(0.0)
-    if q[0] > 0.0 and q[0] < size and q[1] > 0.0 and q[1] < size and q[2] > 0.0:
-        inside = wp.float32(1.0)
+    inside = wp.where(q[0] > 0.0 and q[0] < size and q[1] > 0.0 and q[1] < size and q[2] > 0.0, 1.0, 0.0)
     seen = wp.float32(0.0)
     facing = wp.float32(1.0)
     view_weight = inside

@@ -31,9 +31,7 @@ def cell_exit(origin: wp.vec3, direction: wp.vec3, radius: float, size: int, x: 
     t = wp.float32(3.0e38)
     for k in range(3):
         if wp.abs(direction[k]) > MIN_DIRECTION:
-            face = cell[k]
-            if direction[k] > 0.0:
-                face = face + 1.0
+            face = cell[k] + wp.where(direction[k] > 0.0, 1.0, 0.0)
             t = wp.min(t, (face * edge - radius - origin[k]) / direction[k])
     return t
 

@@ -63,27 +63,6 @@ def test_strides_do_not_matter(device, name):
         assert all(same(first[k], second[k]) for k in first)
 
 
-@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.rows])
-def test_an_expanded_row_is_as_good_as_its_copies(device, name):
-    case = CASES[name]
-    rows = {k: v.detach()[:1] if k in case.rows else v.detach() for k, v in leaves_of(case, device).items()}
-    one = {k: v.clone().requires_grad_(k in case.grads) for k, v in rows.items()}
-    wide = {k: v.expand(ROWS, *v.shape[1:]) if k in case.rows else v for k, v in one.items()}
-    copies = {
-        k: v.detach().repeat(ROWS, *[1] * (v.ndim - 1)) if k in case.rows else v.detach().clone()
-        for k, v in one.items()
-    }
-    copies = {k: v.requires_grad_(k in case.grads) for k, v in copies.items()}
-    outs, others = case.run(**wide), case.run(**copies)
-    assert all(same(a, b) for a, b in zip(outs, others, strict=True))
-    if case.grads:
-        first, second = gradients(case, one, outs), gradients(case, copies, others)
-        for k, g in first.items():
-            expected = second[k].sum(0, keepdim=True) if k in case.rows else second[k]
-            # 40 float32 terms
-            torch.testing.assert_close(g, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
-
-
 @pytest.mark.parametrize("name", DIFFERENTIABLE)
 def test_one_gradient_alone_is_that_of_all_and_backward_can_be_repeated(device, name):
     case = CASES[name]

@@ -97,10 +97,7 @@ def camera(count: int | None = None) -> Camera:
 
 
 def asset() -> reli3d.Asset:
-    unwrapped = reli3d.unwrap(ball(), texture_size=64)
-    unwrapped = reli3d.Mesh(
-        unwrapped.vertices, unwrapped.faces, unwrapped.normals, unwrapped.uv, unwrapped.with_tangents().tangents
-    )
+    unwrapped = reli3d.unwrap(ball(), texture_size=64).with_tangents()
     maps = reli3d.bake(unwrapped, 64, lambda position, normal: 0.5 + 0.4 * normal)
     return reli3d.Asset(unwrapped, reli3d.TextureSet(maps["value"], 0.5, 0.1), lights.LIGHTS["sky"](16))
 

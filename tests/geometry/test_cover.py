@@ -128,10 +128,9 @@ def test_equals_the_float64_reference_on_a_rough_field(device):
     assert float(((got - expected).abs() < 2e-4).double().mean()) > 0.999
 
 
-def covered_fractions(model, views):
+def covered_fractions(field):
     """Fraction of the pixels inside the silhouettes whose rays meet the mesh; and of the mesh's that lie inside."""
-    field = pipeline.encode(model, pipeline.prepare(model, views, pipeline.normalize(views, "auto")))
-    mesh, maps = pipeline.extract(field, model.preset.resolution), field.maps
+    mesh, maps = pipeline.extract(field, field.model.preset.resolution), field.maps
     scene = RayScene(mesh.vertices, mesh.faces)
     hit = torch.stack([scene.closest(*camera_rays(camera)).face >= 0 for camera in maps.camera])
     inside = maps.images[..., 3] > 0
@@ -144,10 +143,11 @@ def test_the_mesh_has_the_silhouettes_of_the_photographs(count, least, monkeypat
     """The error is at the outline, where smoothing takes a fraction of a cell: more of it bulges from one view."""
     model = load_model("small", "cpu")
     views = load_views(Path(reli3d.__file__).parent / "assets/example", views=count)
-    covered, exact = covered_fractions(model, views)
+    field = pipeline.encode(model, pipeline.prepare(model, views, pipeline.normalize(views, "auto")))
+    covered, exact = covered_fractions(field)
     assert covered > least and exact > 0.975
     monkeypatch.setattr(pipeline, "cover_silhouettes", lambda sdf, *args, **options: sdf)
-    assert covered_fractions(model, views)[0] < least
+    assert covered_fractions(field)[0] < least
 
 
 def test_without_views_the_field_is_returned_unchanged(device):

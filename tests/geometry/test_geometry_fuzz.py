@@ -55,20 +55,25 @@ def wild_weights(shape, generator, reach):
     return torch.where(torch.rand(shape, generator=generator) < 0.5, pick, torch.rand(shape, generator=generator) + 0.5)
 
 
+def wild_fields(generator, reach):
+    """A field with all its weights, outside at the border: no padding, which the reference lacks."""
+    sdf, n = wild((CUBES + 1,) * 3, generator), CUBES**3
+    for axis in range(3):
+        sdf.select(axis, 0).abs_(), sdf.select(axis, -1).abs_()
+    return {
+        "sdf": sdf,
+        "deformation": (torch.randint(3, (*sdf.shape, 3), generator=generator) - 1) * (0.49 / CUBES),
+        "alpha": wild_weights((n, 8), generator, reach),
+        "beta": wild_weights((n, 12), generator, reach),
+        "gamma": wild_weights((n,), generator, reach),
+    }
+
+
 @pytest.mark.parametrize("reach", [0, 6])
 def test_gradients_of_flexicubes(device, reach):
     """``reach``: the published activations' range, then all that is allowed."""
-    g, n = torch.Generator().manual_seed(reach), CUBES**3
-    sdf = wild((CUBES + 1,) * 3, g)
-    for axis in range(3):  # outside at the border: no padding, which the reference lacks
-        sdf.select(axis, 0).abs_(), sdf.select(axis, -1).abs_()
-    leaves = {
-        "sdf": sdf,
-        "deformation": (torch.randint(3, (*sdf.shape, 3), generator=g) - 1) * (0.49 / CUBES),
-        "alpha": wild_weights((n, 8), g, reach),
-        "beta": wild_weights((n, 12), g, reach),
-        "gamma": wild_weights((n,), g, reach),
-    }
+    g = torch.Generator().manual_seed(reach)
+    leaves = wild_fields(g, reach)
     ours = {k: v.to(device).requires_grad_() for k, v in leaves.items()}
     weights = CubeWeights(**{k: ours[k] for k in leaves if k != "sdf"})
     mesh = extract_surface(ours["sdf"], radius=0.5, center=True, weights=weights)
@@ -95,16 +100,7 @@ def test_gradients_of_flexicubes(device, reach):
 
 @pytest.mark.parametrize("reach", [0, 6])
 def test_gradients_of_the_deviation(device, reach):
-    g, n = torch.Generator().manual_seed(10 + reach), CUBES**3
-    sdf = wild((CUBES + 1,) * 3, g)
-    for axis in range(3):
-        sdf.select(axis, 0).abs_(), sdf.select(axis, -1).abs_()
-    leaves = [
-        sdf,
-        (torch.randint(3, (*sdf.shape, 3), generator=g) - 1) * (0.49 / CUBES),
-        wild_weights((n, 8), g, reach),
-        wild_weights((n, 12), g, reach),
-    ]
+    leaves = list(wild_fields(torch.Generator().manual_seed(10 + reach), reach).values())[:4]
     ours = [v.to(device).requires_grad_() for v in leaves]
     spread = vertex_deviation(ours[0], radius=0.5, weights=CubeWeights(*ours[1:]))
     assert len(spread) > N and finite(spread, *torch.autograd.grad(spread.sum(), ours))

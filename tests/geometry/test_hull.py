@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from reli3d import pipeline
 from reli3d.geometry.camera import Camera
-from reli3d.geometry.hull import hull_distance, hull_grid, hull_span, mask_distance, mirror_residual
+from reli3d.geometry.hull import hull_distance, hull_span, mask_distance, mirror_residual
 from reli3d.nn.local import LocalField
 from reli3d.nn.presets import SMALL
 from reli3d.nn.view_features import ViewMaps
@@ -41,18 +41,23 @@ def test_half_plane_is_exact_for_an_unsaturated_ramp(device):
     torch.testing.assert_close(got[near], true[near], rtol=0, atol=2e-5)  # float32 of coordinates up to 50
 
 
-def test_disc_is_sub_pixel(device):
-    mask, true = disk(128, (63.3, 66.8), 37.2)
+@pytest.mark.parametrize(
+    "size, center, radius, hard, most",
+    [
+        # a coverage that saturates one pixel from the contour moves the linear crossing by at most 0.09 pixels
+        (128, (63.3, 66.8), 37.2, False, 0.1),
+        # beyond 16 pixels the ends of segments will do: 0.25 / 16 too far at most
+        (256, (127.3, 130.8), 60.2, False, 0.1 + 0.25 / 16),
+        # the staircase's corners stand half a pixel diagonal off at most
+        (128, (63.3, 66.8), 37.2, True, 0.75),
+    ],
+)
+def test_distance_to_a_disc(device, size, center, radius, hard, most):
+    mask, true = disk(size, center, radius)
+    mask = (true > 0).float() if hard else mask
     got = mask_distance(mask[None].to(device))[0].cpu()
-    # a coverage that saturates one pixel from the contour moves the linear crossing by at most 0.09 pixels
-    assert (got - true).abs().max() < 0.1
+    assert (got - true).abs().max() < most
     assert bool(((got > 0) == (mask >= 0.5)).all())
-
-
-def test_hard_mask_is_within_half_a_pixel():
-    _, true = disk(128, (63.3, 66.8), 37.2)
-    got = mask_distance((true > 0).float()[None])[0]
-    assert (got - true).abs().max() < 0.75  # the staircase's corners stand half a pixel diagonal off at most
 
 
 def test_two_blobs_and_a_hole_against_brute_force(device):
@@ -133,23 +138,6 @@ def test_with_far_only_points_far_outside_differ(device):
     assert int((got != whole).sum()) > 500, "views are left out"
 
 
-@pytest.mark.parametrize("views, eyes, focal", [(8, 3.0, 300.0), (40, 1.2, 120.0), (3, 0.6, 60.0), (1, 3.0, 300.0)])
-@pytest.mark.parametrize("far", [math.inf, 0.2, 0.0])
-def test_a_grid_has_the_values_of_its_points(device, views, eyes, focal, far):
-    """Ragged masks, wide angles, more views than a block culls, and points behind cameras."""
-    _, camera = sphere_views(device, n=views, distance=eyes, size=128, focal=focal)
-    noise = torch.rand(views, 1, 16, 16, generator=torch.Generator().manual_seed(views))
-    masks = torch.nn.functional.interpolate(noise, size=(128, 128), mode="bilinear")[:, 0]
-    masks = ((masks - 0.4) * 20.0).clamp(0, 1).to(device)
-    distance, axis = mask_distance(masks), torch.linspace(-0.7, 0.7, 42, device=device)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    whole = hull_distance(points, distance, camera)
-    got = hull_grid(axis, distance, camera, far=far).view(-1)
-    near = whole >= -far
-    assert torch.equal(got[near], whole[near]) and bool((got[~near] < -far).all())
-    assert eyes > 1.0 or int((whole == -1000.0).sum()) > 100, "cameras stand among the points"
-
-
 def mirrored_rays(device):
     """Points along rays, which of them count, and planes of which some leave the ball of :func:`sphere_views`."""
     generator = torch.Generator().manual_seed(3)
@@ -175,25 +163,6 @@ def test_how_far_mirrored_rays_miss_the_hull(device):
     assert shown[:, 1:].sum() > 200 and int((expected == 0).sum()) > 100
     assert float((got - expected)[shown].abs().max()) < 0.001 + 0.05 * 0.06
     assert bool((got[expected > 0.19] > 0.18).all())
-
-
-@pytest.mark.parametrize(
-    "name, value",
-    [
-        ("points", torch.zeros(60, 3)),
-        ("known", torch.ones(60, 4, dtype=torch.bool)),
-        ("known", torch.ones(60, 5)),
-        ("offset", torch.zeros(29)),
-        ("most", -0.1),
-        ("most", math.nan),
-    ],
-)
-def test_wrong_rays_and_planes_are_named(name, value):
-    masks, camera = sphere_views("cpu", size=16)
-    points, known, normal, offset = mirrored_rays("cpu")
-    inputs = dict(points=points, known=known, normal=normal, offset=offset, most=0.2) | {name: value}
-    with pytest.raises((TypeError, ValueError), match=name):
-        mirror_residual(**inputs, distance=mask_distance(masks), camera=camera)
 
 
 def test_rays_enter_and_leave_the_cones_of_sight(device):
@@ -243,23 +212,32 @@ def test_object_cut_by_the_border_is_unbounded_only_there(device):
     assert [bool(v > 0) for v in got] == [True, False, False]
 
 
-@pytest.mark.parametrize(
-    "change, error",
-    [
-        (dict(points=torch.zeros(3)), ValueError),
-        (dict(points=torch.zeros(4, 3, dtype=torch.float64)), TypeError),
-        (dict(distance=torch.zeros(8, 1, 5)), ValueError),
-        (dict(camera=Camera(torch.zeros(7, 4, 4), torch.zeros(7, 4), 16, 16)), ValueError),
-        (dict(camera=Camera(torch.zeros(4, 4), torch.zeros(4), 16, 16)), ValueError),
-        (dict(camera=Camera(torch.zeros(8, 4, 4), torch.zeros(8, 4), 16, 15)), ValueError),
-        (dict(camera=torch.zeros(8, 4, 4)), TypeError),
-    ],
-)
-def test_wrong_input_is_named(change, error):
+WRONG = [
+    (hull_distance, "points", torch.zeros(3)),
+    (hull_distance, "points", torch.zeros(4, 3, dtype=torch.float64)),
+    (hull_distance, "distance", torch.zeros(8, 1, 5)),
+    (hull_distance, "camera", Camera(torch.zeros(7, 4, 4), torch.zeros(7, 4), 16, 16)),
+    (hull_distance, "camera", Camera(torch.zeros(4, 4), torch.zeros(4), 16, 16)),
+    (hull_distance, "camera", Camera(torch.zeros(8, 4, 4), torch.zeros(8, 4), 16, 15)),
+    (hull_distance, "camera", torch.zeros(8, 4, 4)),
+    (mirror_residual, "points", torch.zeros(60, 3)),
+    (mirror_residual, "known", torch.ones(60, 4, dtype=torch.bool)),
+    (mirror_residual, "known", torch.ones(60, 5)),
+    (mirror_residual, "offset", torch.zeros(29)),
+    (mirror_residual, "most", -0.1),
+    (mirror_residual, "most", math.nan),
+]
+
+
+@pytest.mark.parametrize("function, name, value", WRONG)
+def test_wrong_input_is_named(function, name, value):
     masks, camera = sphere_views("cpu", size=16)
-    inputs = dict(points=torch.zeros(4, 3), distance=mask_distance(masks), camera=camera) | change
-    with pytest.raises(error, match=next(iter(change))):
-        hull_distance(**inputs)
+    inputs = {"points": torch.zeros(4, 3)}
+    if function is mirror_residual:
+        inputs = dict(zip(("points", "known", "normal", "offset"), mirrored_rays("cpu"), strict=True), most=0.2)
+    inputs |= {"distance": mask_distance(masks), "camera": camera, name: value}
+    with pytest.raises((TypeError, ValueError), match=name):
+        function(**inputs)
 
 
 @pytest.mark.parametrize("mask", [torch.full((1, 4, 4), 2.0), torch.full((1, 4, 4), math.nan), torch.zeros(4, 4)])
@@ -282,10 +260,3 @@ def test_the_reach_is_that_of_the_points_inside(device, radius, views):
     empty = replace(maps, images=images - 1000.0)
     with pytest.raises(ValueError, match="masks: expected masks that overlap"):
         pipeline._hull_reach(LocalField(empty, model, None, None, None, None, None), 80)
-
-
-def test_far_from_the_contour_the_ends_of_segments_will_do(device):
-    """Beyond 16 pixels 0.25 / 16 too far at most; the disc itself is known to 0.1 pixels (above)."""
-    mask, true = disk(256, (127.3, 130.8), 60.2)
-    got = mask_distance(mask[None].to(device))[0].cpu()
-    assert (got - true).abs().max() < 0.1 + 0.25 / 16

@@ -264,3 +264,8 @@ def test_tiny_huge_and_invalid_rays_come_to_an_end(device, backend, count):
             hits = scene.closest(*mixed)
             assert bool((hits.face[1::2] == -1).all()) and torch.equal(hits.face[::2], expected.face[::2])
             assert torch.equal(scene.occluded(*mixed), hits.face >= 0)
+    none = torch.zeros_like(d)
+    assert bool((scene.closest(o, none).face == -1).all()) and not bool(scene.occluded(o, none).any())
+    for limit in (float("nan"), -1.0, 0.0):
+        assert bool((scene.closest(o, d, t_max=limit).face == -1).all())
+        assert not bool(scene.occluded(o, d, t_max=limit).any())

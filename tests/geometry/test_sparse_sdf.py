@@ -33,18 +33,12 @@ def test_same_surface_to_the_bit_from_fewer_points(count):
     got, evaluated = sparse(sdf, near)
     assert len(evaluated) == len(evaluated.unique()), "a point is evaluated once"
     assert len(evaluated) < 0.75 * int(near.sum())
-    expected = extract_surface(torch.where(near, sdf, 9.0), radius=1.0)
-    mesh = extract_surface(got, radius=1.0)
-    assert torch.equal(mesh.vertices, expected.vertices) and torch.equal(mesh.faces, expected.faces)
-
-
-def test_every_value_above_the_depth_is_exact():
-    sdf = lumps(grid(32))
-    near = sdf < 2.0
-    got, _ = sparse(sdf, near)
     shallow = near & (got != -INSIDE_DEPTH)
     assert torch.equal(got[shallow], sdf[shallow]) and bool((got[~near] == 9.0).all())
     assert bool((sdf[~shallow & near] < 0.0).all())
+    expected = extract_surface(torch.where(near, sdf, 9.0), radius=1.0)
+    mesh = extract_surface(got, radius=1.0)
+    assert torch.equal(mesh.vertices, expected.vertices) and torch.equal(mesh.faces, expected.faces)
 
 
 def test_a_surface_that_leaves_the_region_is_followed():
@@ -57,12 +51,6 @@ def test_a_surface_that_leaves_the_region_is_followed():
         for k in (0, 1):
             ends = before != after
             assert torch.equal(got.narrow(axis, k, 32)[ends], sdf.narrow(axis, k, 32)[ends])
-
-
-def test_without_near_points_nothing_is_evaluated():
-    sdf = torch.ones(8, 8, 8)
-    got, evaluated = sparse(sdf, torch.zeros(8, 8, 8, dtype=torch.bool), known=sdf)
-    assert len(evaluated) == 0 and torch.equal(got, sdf)
 
 
 def test_known_values_outside_the_region_are_kept():

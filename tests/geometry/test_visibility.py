@@ -76,23 +76,6 @@ def test_inactive_pairs_are_false_and_the_others_unchanged(device, fraction):
     assert not fraction or 0.1 < got[active].float().mean() < 0.9
 
 
-def test_wrong_inputs_are_reported(device):
-    camera = rig(device)
-    scene = RayScene(torch.zeros(0, 3, device=device), torch.zeros(0, 3, dtype=torch.int32, device=device))
-    p = points(device, 4)
-    assert visible_from(scene, p[:0], p[:0], camera).shape == (0, 3)
-    with pytest.raises(ValueError, match="normal: expected shape"):
-        visible_from(scene, p, p[:, :2], camera)
-    with pytest.raises(ValueError, match="active: expected shape"):
-        visible_from(scene, p, p, camera, torch.ones(4, 2, dtype=torch.bool, device=device))
-    with pytest.raises(ValueError, match="active: expected shape"):
-        visible_from(scene, p, p, camera, torch.ones(3, 3, dtype=torch.bool, device=device))
-    with pytest.raises(ValueError, match="active: expected shape"):
-        visible_from(scene, p, p, camera, torch.ones(4, 1, 3, dtype=torch.bool, device=device))
-    with pytest.raises(TypeError, match="active: expected torch.bool"):
-        visible_from(scene, p, p, camera, torch.ones(4, 3, device=device))
-
-
 @pytest.mark.parametrize("scale", [2.0**-12, 2.0**12])
 def test_visibility_does_not_depend_on_the_scale(device, scale):
     """Two balls that hide each other; the scale is a power of two, so that all numbers but the offset scale exactly."""
@@ -107,3 +90,17 @@ def test_visibility_does_not_depend_on_the_scale(device, scale):
         vertices = factor * mesh.vertices
         found.append(visible_from(RayScene(vertices, mesh.faces), vertices[index], normal[index], cameras))
     assert torch.equal(*found) and 0.1 < float(found[0].float().mean()) < 0.9
+
+
+def test_wrong_inputs_are_reported(device):
+    camera = rig(device)
+    scene = RayScene(torch.zeros(0, 3, device=device), torch.zeros(0, 3, dtype=torch.int32, device=device))
+    p = points(device, 4)
+    assert visible_from(scene, p[:0], p[:0], camera).shape == (0, 3)
+    with pytest.raises(ValueError, match="normal: expected shape"):
+        visible_from(scene, p, p[:, :2], camera)
+    for shape in ((4, 2), (3, 3), (4, 1, 3)):
+        with pytest.raises(ValueError, match="active: expected shape"):
+            visible_from(scene, p, p, camera, torch.ones(shape, dtype=torch.bool, device=device))
+    with pytest.raises(TypeError, match="active: expected torch.bool"):
+        visible_from(scene, p, p, camera, torch.ones(4, 3, device=device))
