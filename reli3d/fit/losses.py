@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from reli3d.fit.unknowns import Unknowns, light_maps
-from reli3d.geometry.grid import squared_laplacian
 
 MIN_LINEAR = 0.02  # linear radiance below which the display's derivative is constant: there images contain mostly noise
 HUBER_DELTA = 0.25  # display values; larger residuals count linearly: reflected surroundings, glare, wrong masks
@@ -27,7 +26,7 @@ class Weights:
     outline: float = 30.0  # of :func:`outline`
     agreement: float = 0.3  # of :func:`agreement`
     shading: float = 30.0  # of :func:`display_error` while the surface is fitted
-    curvature: float = 0.5  # of :func:`curvature`
+    curvature: float = 0.5  # of the squared Laplacian of the signed distance, where silhouettes and colors say little
     sdf_change: float = 2e-3  # of the squared change of the signed distance; divided by the number of views
     image: float = 1.0  # of :func:`display_error` in the fit of the maps and the lighting
     palette: float = 0.01  # of :func:`palette`
@@ -79,15 +78,6 @@ def agreement(color: Tensor, weight: Tensor) -> Tensor:
     variance = AGREEMENT_SIGMA**2
     robust = variance * (1.0 - torch.exp(-square / (2.0 * variance)))  # bounded: outliers have no gradient
     return ((weight * robust).sum(1) * valid).sum() / valid.sum().clamp(min=1) / variance
-
-
-def curvature(sdf: Tensor, cell: float, weight: Tensor) -> Tensor:
-    """Weighted sum of the squared Laplacian of the signed distance, in cells.
-
-    sdf, weight: ``(X, Y, Z)``.  cell: side of a cell.  The term regularizes the surface where silhouettes and colors
-    do not constrain it.
-    """
-    return squared_laplacian(sdf, weight) / (cell * cell)
 
 
 def total_variation(values: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from reli3d.fit.shading import radiance
 from reli3d.fit.unknowns import Start, Unknowns, corrected, material_change, material_of, unit
 from reli3d.fit.view_colors import MIN_COVERAGE, display_planes, view_colors, view_weights
 from reli3d.geometry.distance import signed_distance
-from reli3d.geometry.grid import sample_grid
+from reli3d.geometry.grid import sample_grid, squared_laplacian
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
 from reli3d.geometry.rays import RayScene
@@ -101,7 +101,7 @@ def hull_sdf(images: InputImages, grid: Grid) -> Tensor:
 
 @torch.no_grad()
 def curvature_weight(sdf: Tensor, bound: Tensor, cell: float) -> Tensor:
-    """Weights ``(X, Y, Z)`` of :func:`losses.curvature` at the points of the grid.
+    """Weights ``(X, Y, Z)`` of the squared Laplacian at the points of the grid.
 
     1 near parts at least ``2 CORE_DEPTH_CELLS`` thick, ``THIN_WEIGHT`` near thinner parts, 0 beyond ``BAND_CELLS`` from
     the surface.  The medial axis of a thin part, where the curvature of the signed distance is large, lies inside the
@@ -209,7 +209,7 @@ def shape_loss(
     scene = RayScene(mesh.vertices, mesh.faces)
     views, grid = len(data.images), data.grid
     moved = (unknowns.sdf.reshape(-1).index_select(0, data.near) - data.first) / grid.cell
-    loss = weights.curvature * losses.curvature(unknowns.sdf, grid.cell, data.smooth)
+    loss = weights.curvature * (squared_laplacian(unknowns.sdf, data.smooth) / (grid.cell * grid.cell))
     loss = loss + weights.sdf_change / views * moved.square().mean()
     loss = loss + weights.outline * _outlines(unknowns, data, mesh, scene, rng)
     loss = loss + _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent)

@@ -82,12 +82,9 @@ def base_color_factor(asset: Asset, images: Tensor, inside: Tensor, camera: Came
     weights = [1.0 / spread**2 for spread in (ALBEDO_SPREAD, LIGHT_SPREAD, PREDICTION_SPREAD)]
     estimates = torch.stack([seen.new_tensor(ALBEDO), photograph.mean().log() - LIGHT, prediction.mean().log()])
     brightness = (seen.new_tensor(weights) * estimates).sum() / sum(weights)
-    color = (PHOTOGRAPH_COLOR * _color(photograph) + PREDICTED_COLOR * _color(prediction)).exp()
+    logs = [color.log() - color.log().mean() for color in (photograph, prediction)]
+    color = (PHOTOGRAPH_COLOR * logs[0] + PREDICTED_COLOR * logs[1]).exp()
     return (brightness.exp() * color / color.mean() / prediction).clamp(1.0 / FARTHEST, FARTHEST)
-
-
-def _color(value: Tensor) -> Tensor:
-    return value.log() - value.log().mean()
 
 
 def _seen(

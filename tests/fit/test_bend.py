@@ -20,7 +20,6 @@ from reli3d.render.gbuffer import surface_points
 from tests.support import small_scene
 
 VIEWS, SIZE = 6, 36
-STAGE = maps.MapsStage("maps", until=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +48,7 @@ def fitted(start, images, weights: Weights, steps: int = 40, unknowns: Unknowns 
     views, budget = list(range(VIEWS)), Budget(steps=steps)
     none = torch.zeros_like(start.mesh.vertices)
     data = FixedSurface(Start.of(start), start, none, images, views)
-    maps.fit_maps(unknowns, data, weights, budget, STAGE, seed=0)
+    maps.fit_maps(unknowns, data, weights, budget, "maps", 1.0, seed=0)
     return unknowns
 
 

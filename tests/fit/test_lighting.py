@@ -31,7 +31,6 @@ from reli3d.views.views import ViewBatch
 from tests.support import small_scene
 
 VIEWS, SIZE, STEPS = 6, 28, 30
-STAGE = maps.MapsStage("light", until=1.0, detail=False)  # light, exposures and the base color's grids
 OPTIONS = ShadeOptions(samples=(24, 8, 8), diffuse_model="published")
 
 
@@ -60,7 +59,8 @@ def fitted(views, light, steps: int = STEPS) -> tuple:
     first = replace(small_scene.ball(), environment=Environment(torch.full((16, 32, 3), 0.5)))
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS, max(images.light_group) + 1)
     data = FixedSurface(Start.of(first), first, gathered(first.mesh, images, seed=0), images, list(range(VIEWS)))
-    maps.fit_maps(unknowns, data, Weights(), Budget(steps=steps), STAGE, seed=0)
+    budget = Budget(steps=steps)
+    maps.fit_maps(unknowns, data, Weights(), budget, "light", 1.0, seed=0, detail=False)  # and the base color's grids
     return changed(first, unknowns), Lights.of(unknowns, data.start, images)
 
 
