@@ -67,8 +67,7 @@ def agreement(color: Tensor, weight: Tensor) -> Tensor:
     """Photo-consistency: weighted variance of a point's color over the views, robust, mean over points.
 
     color: ``(N, V, 3)`` display values at the projections of each point.  weight: ``(N, V)``, 0 where it is occluded.
-    Except in highlights, a point on the true surface has the same color in all views.  The term needs neither lighting
-    nor material, so it is used before these are fitted.  Points visible in fewer than two views do not count.
+    The term needs neither lighting nor material.  Points visible in fewer than two views do not count.
     """
     total = weight.sum(1)
     valid = (weight > 0.0).sum(1) >= 2
@@ -93,9 +92,9 @@ def near_start(grids: Sequence[Tensor]) -> Tensor:
 def near_base_color(change: Tensor, weights: Weights, views: int) -> Tensor:
     """Robust prior that pulls the base color to the start, mean over points; change: ``(N, 3)`` in logits.
 
-    Few views constrain normals and lighting poorly, and the residual shading would be baked into the base color as a
-    small change at most points.  Correcting a wrong initial color needs a large change, so the gradient decreases above
-    ``BASE_COLOR_SCALE``.  The weight is divided by ``views**4``: 0.25 at 3 views and 5e-4 at 14.
+    With few views, residual shading would be baked into the base color as a small change at most points; a wrong
+    initial color needs a large change, so the gradient decreases above ``BASE_COLOR_SCALE``.  The weight is divided by
+    ``views**4``: 0.25 at 3 views and 5e-4 at 14.
     """
     square = change.square().mean(1)
     return weights.base_color / views**4 * (square / (1.0 + square / (BASE_COLOR_SCALE * BASE_COLOR_SCALE))).mean()
@@ -121,9 +120,8 @@ def hue_drift(color: Tensor, start: Tensor) -> Tensor:
     """Squared change of the object's mean chromaticity, in log base color.
 
     color, start: ``(N, 3)`` logarithms of base color at the same points.  A factor per channel is ambiguous between
-    base color and lighting: a red object under white light looks like a white one under red light.  The start,
-    predicted from learned priors, resolves this ambiguity.  Brightness is not constrained, because the start's is often
-    wrong.
+    base color and lighting; the start, predicted from learned priors, resolves this.  Brightness is not constrained,
+    because the start's is often wrong.
     """
     drift = (color - start).mean(0)
     return (drift - drift.mean()).square().mean()

@@ -104,9 +104,9 @@ def curvature_weight(sdf: Tensor, bound: Tensor, cell: float) -> Tensor:
     """Weights ``(X, Y, Z)`` of the squared Laplacian at the points of the grid.
 
     1 near parts at least ``2 CORE_DEPTH_CELLS`` thick, ``THIN_WEIGHT`` near thinner parts, 0 beyond ``BAND_CELLS`` from
-    the surface.  The medial axis of a thin part, where the curvature of the signed distance is large, lies inside the
-    band, so with full weight the term would remove the part.  Points deeper than ``CORE_DEPTH_CELLS`` form the core of
-    thick parts; band points that no core reaches count as thin.
+    the surface.  The medial axis of a thin part lies inside the band, so with full weight the term would remove the
+    part.  Points deeper than ``CORE_DEPTH_CELLS`` form the core of thick parts; band points that no core reaches count
+    as thin.
     """
     core = (torch.maximum(sdf, bound) < -CORE_DEPTH_CELLS * cell).to(sdf)[None, None]
     reach = round(CORE_DEPTH_CELLS + BAND_CELLS) + 1

@@ -97,7 +97,7 @@ def spread_rows(n: int, count: int, seed: int) -> Tensor:
 
 
 def _spread(count: int, seed: int) -> Tensor:
-    """Stratified numbers: one in each of ``count`` equal parts of [0, 1), float64."""
+    """One random number in each of ``count`` equal parts of [0, 1), float64."""
     jitter = torch.rand(count, dtype=torch.float64, generator=torch.Generator().manual_seed(int(seed)), device="cpu")
     return (torch.arange(count, dtype=torch.float32, device="cpu") + jitter) / count
 
@@ -122,9 +122,8 @@ def _draw(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``each`` samples of every strategy at P points, S per point, float64.
 
-    Returns values over q ``(P, S, 3)``, densities over q ``(P, S, 3)``, and the densities normalized so that the
-    samples of a strategy, with its own samples below the horizon, have weight 1; then a constant integrand has
-    variance 0.
+    Returns values and densities over q, both ``(P, S, 3)``, and the densities normalized so that a strategy's samples,
+    with its own below the horizon, have weight 1; then a constant integrand has variance 0.
     """
     n, count, device = len(values[0]), 3 * each, values[0].device
     own = dict(samples=(each,) * 3, seed=options.seed, antithetic="none", diffuse_model=options.diffuse_model)

@@ -1,13 +1,12 @@
 """Silhouette antialiasing, differentiable in the vertices, for images sampled at pixel centers.
 
 After Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.4: two neighboring
-pixels are blended where a silhouette crosses the line between their centers.  Laine et al. search for the silhouette
-edge among the edges of the triangle at a pixel center, which misses edges of triangles smaller than a pixel.  Here all
-crossings of edges with rows and columns of pixel centers are listed, and each is tested for visibility with a ray.
+pixels are blended where a silhouette crosses the line between their centers.  Unlike there, all crossings of edges with
+rows and columns of pixel centers are listed, and each is tested for visibility with a ray, so that edges of triangles
+smaller than a pixel are found.
 
-The sum over an antialiased mask has the exact derivative of the covered area.  Compared with exact area coverage in [0,
-1], pixels crossed by a silhouette have a mean absolute error of 0.01 to 0.03; gradients of a sum of squared differences
-have a relative error of about 10 %.
+The sum over an antialiased mask has the exact derivative of the covered area.  Pixels crossed by a silhouette have a
+mean absolute error of 0.01 to 0.03 of coverage; gradients of a sum of squared differences err by about 10 %.
 """
 
 import numpy as np

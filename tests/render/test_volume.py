@@ -186,18 +186,15 @@ def test_occupancy_of_a_field_covers_it_and_changes_no_image(device):
 
 
 def test_bad_input_is_named(device):
-    grid, (origins, directions) = full_grid(4, 1.0, device), rays(device, 4)
-    for keywords, name in (
-        ({"step": 0.0}, "step"),
-        ({"step": 0.1, "near": 2.0, "far": 1.0}, "near"),
-        ({"step": 0.1, "shift": torch.ones(4, device=device)}, "shift"),
-    ):
-        with pytest.raises(ValueError, match=name):
-            march_rays(origins, directions, grid, **keywords)
-    with pytest.raises(ValueError, match="directions: expected shape"):
-        march_rays(origins, directions[:2], grid, 0.1)
-    with pytest.raises(ValueError, match="occupied: expected"):
-        OccupancyGrid(torch.ones(2, 3, 2, dtype=torch.bool, device=device), 1.0)
+    grid, (o, d) = full_grid(4, 1.0, device), rays(device, 4)
     samples, density, color = packed([3], device)
-    with pytest.raises(ValueError, match="density: expected"):
-        composite(density[:2], color, samples)
+    for call, message in (
+        (lambda: march_rays(o, d, grid, 0.0), "step"),
+        (lambda: march_rays(o, d, grid, 0.1, near=2.0, far=1.0), "near"),
+        (lambda: march_rays(o, d, grid, 0.1, shift=torch.ones(4, device=device)), "shift"),
+        (lambda: march_rays(o, d[:2], grid, 0.1), "directions: expected shape"),
+        (lambda: OccupancyGrid(torch.ones(2, 3, 2, dtype=torch.bool, device=device), 1.0), "occupied: expected"),
+        (lambda: composite(density[:2], color, samples), "density: expected"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
