@@ -177,11 +177,9 @@ class ShapeData:
         colored: list[int],
     ) -> ShapeData:
         """Resamples the images to the sizes of the fit and computes the weights of the grid's points."""
-        sizes = sorted(
-            {max(16, round(images.size * s)) for s in (IMAGE_SCALES[0], sum(IMAGE_SCALES) / 2, IMAGE_SCALES[1])}
-        )
+        sizes = {max(16, round(images.size * s)) for s in (*IMAGE_SCALES, sum(IMAGE_SCALES) / 2)}
         used = images.select(colored)
-        planes = [display_planes(used.resized(size)) for size in sizes]
+        planes = [display_planes(used.resized(size)) for size in sorted(sizes)]
         small = images.resized(min(OUTLINE_PIXELS, images.size))
         smooth = curvature_weight(sdf, bound, grid.cell)
         near = torch.nonzero(smooth.reshape(-1))[:, 0]
@@ -212,8 +210,7 @@ def shape_loss(
     loss = weights.curvature * (squared_laplacian(unknowns.sdf, data.smooth) / (grid.cell * grid.cell))
     loss = loss + weights.sdf_change / views * moved.square().mean()
     loss = loss + weights.outline * _outlines(unknowns, data, mesh, scene, rng)
-    loss = loss + _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent)
-    return loss
+    return loss + _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent)
 
 
 def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, rng) -> Tensor:
@@ -232,10 +229,8 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     planes = data.planes[min(int(progress * len(data.planes)), len(data.planes) - 1)]
     size, images = planes.shape[-1], data.images.select(data.colored)
     camera = corrected(images.camera.resized(size, size), unknowns.pose[data.colored])
-    pick = torch.randint(len(mesh.vertices), (CONSISTENCY_POINTS,), generator=rng, dtype=torch.int64, device="cpu").to(
-        mesh.vertices.device
-    )
-    position, normal = (v.index_select(0, pick) for v in (mesh.vertices, mesh.normals))
+    pick = torch.randint(len(mesh.vertices), (CONSISTENCY_POINTS,), generator=rng, dtype=torch.int64, device="cpu")
+    position, normal = (v.index_select(0, pick.to(v.device)) for v in (mesh.vertices, mesh.normals))
     color, cover = view_colors(planes, position, camera)
     weight = view_weights(scene, position, normal, camera) * (cover.detach() > MIN_COVERAGE)
     exposure = unknowns.exposure[data.colored].exp()
@@ -267,9 +262,8 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
             other = lit(2 * seed + 1)
     loss = loss + weights.shading * losses.display_error(image, other, target, target > SATURATED_LINEAR)
     # the same ratio of the terms as in the fit of the maps
-    loss = loss + weights.shading * weights.palette * losses.palette(
-        points.base_color.clamp(min=losses.MIN_LINEAR).log(), target
-    )
+    logs = points.base_color.clamp(min=losses.MIN_LINEAR).log()
+    loss = loss + weights.shading * weights.palette * losses.palette(logs, target)
     loss = loss + weights.shading * losses.near_base_color(change[:, :3], weights, len(data.colored))
     return loss + weights.shading * losses.priors(unknowns, weights, len(data.images))
 

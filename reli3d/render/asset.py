@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torch import Tensor
 
 from reli3d._bridge import Movable, check, expect, present, tensor_of
@@ -12,7 +11,6 @@ from reli3d.render.environment import Environment
 
 FLAT = (0.5, 0.5, 1.0)  # texel of a normal map without perturbation
 WRAPS = ("repeat", "mirror", "clamp")  # glTF's REPEAT, MIRRORED_REPEAT, CLAMP_TO_EDGE
-KEPT = 2048  # texels a side up to which lookups are kept: 50 MB
 
 
 @dataclass(frozen=True, repr=False)
@@ -70,24 +68,6 @@ class TextureSet(Movable):
     def size(self) -> int:
         """Texels per side."""
         return self.base_color.shape[0]
-
-    def rough_metal(self) -> Tensor:
-        """Map ``(T, T, 3)`` with the channels roughness, metallic, metallic: one three-channel lookup reads both maps.
-
-        Cached for gradient-free maps of at most ``KEPT`` texels per side until they are modified.
-        """
-        sources = self.roughness, self.metallic
-        changing = torch.is_inference_mode_enabled() or any(
-            s.is_inference() or (s.requires_grad and torch.is_grad_enabled()) for s in sources
-        )
-        lasting = self.size <= KEPT and not changing
-        written = tuple(s._version for s in sources) if lasting else None
-        kept, values = vars(self).get("_rough_metal", (None, None))
-        if not lasting or kept != written:
-            values = torch.stack([self.roughness, self.metallic, self.metallic], -1)
-        if lasting:
-            object.__setattr__(self, "_rough_metal", (written, values))
-        return values
 
     def __repr__(self) -> str:
         return f"TextureSet({self.size} x {self.size} texels, {self.base_color.device})"

@@ -246,21 +246,3 @@ def test_parts_shadow_each_other_and_keep_their_base_color(device):
     alone = render_asset(parts[1:], camera, Environment.constant(torch.ones(3, device=device)))
     near = below & (image.position.norm(dim=-1) < 0.9)
     assert float(image.radiance[near].mean()) < 0.9 * float(alone.radiance[near].mean())
-
-
-def test_lookups_follow_the_maps(device):
-    maps = textures(8, device, (0.5, 0.2, 0.1), roughness=0.3)
-    with torch.inference_mode():
-        assert maps.rough_metal().is_inference()
-    first = maps.rough_metal()
-    assert not first.is_inference()
-    assert maps.rough_metal() is first  # kept
-    maps.roughness.fill_(0.9)
-    again = maps.rough_metal()
-    assert float(again[..., 0].min()) == pytest.approx(0.9) and float(first[..., 0].max()) == pytest.approx(0.3)
-    leaf = TextureSet(maps.base_color, maps.roughness.clone().requires_grad_(), 0.0)
-    for _ in range(2):  # a graph for each
-        leaf.rough_metal().sum().backward()
-    assert float(leaf.roughness.grad.min()) > 0
-    with torch.inference_mode():
-        torch.testing.assert_close(textures(8, device).rough_metal()[..., 0], torch.full((8, 8), 0.5, device=device))
