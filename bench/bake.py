@@ -63,11 +63,7 @@ def glb(device, subdivisions, size):
     return lambda: glb_bytes(asset), {"texels": 3 * size * size}
 
 
-CASES = {
-    "texels": (texels, dict(subdivisions=5, size=1024)),
-    "nearest": (nearest, dict(subdivisions=5, size=1024)),
-    "bake": (whole, dict(subdivisions=5, size=1024)),
-    "tangents": (tangents, dict(subdivisions=5, size=1024)),
-    "glb": (glb, dict(subdivisions=5, size=1024)),
-}
+_SIZE = dict(subdivisions=5, size=1024)
+CASES = {"texels": (texels, _SIZE), "nearest": (nearest, _SIZE), "bake": (whole, _SIZE)}
+CASES |= {"tangents": (tangents, _SIZE), "glb": (glb, _SIZE)}
 PEERS = {"nearest": ("scipy", scipy_nearest)}

@@ -18,25 +18,19 @@ def square_kernel(
     y[i] = x[i] * x[i]
 
 
-def square(device, n, backward):
+def square(device, n, backward, square_of=lambda x: _bridge.call(square_kernel, len(x), [x], [(len(x),)])[0]):
     """Squares of ``n`` numbers through a kernel, with the gradient of their sum if ``backward``."""
     x = torch.linspace(0, 1, n, device=device).requires_grad_(backward)
 
     def step():
-        (y,) = _bridge.call(square_kernel, n, [x], [(n,)])
+        y = square_of(x)
         return torch.autograd.grad(y.sum(), x) if backward else y
 
     return step, {"numbers": n}
 
 
 def torch_square(device, n, backward):
-    x = torch.linspace(0, 1, n, device=device).requires_grad_(backward)
-
-    def step():
-        y = x * x
-        return torch.autograd.grad(y.sum(), x) if backward else y
-
-    return step, {"numbers": n}
+    return square(device, n, backward, lambda x: x * x)
 
 
 CASES = {

@@ -4,13 +4,10 @@ Grid query of the density, deformation and weight heads, extraction, atlas, bake
 the pipeline's own functions on the published preset's triplane and heads with random weights.  The network before them
 is cut to a stub that never runs.  The density's output is replaced by the bench's field, of 25,000 faces at resolution
 80, so that there is a surface to texture; its head is evaluated all the same.
-
-``python -m bench.mesh_stage`` prints the stages for resolutions 32 to 256 and textures of 512 to 4096.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from functools import lru_cache
 
@@ -80,28 +77,4 @@ def mesh_stage(device, resolution, size):
     return lambda: stages(known, resolution, size), {"texels": size * size}
 
 
-CASES = {
-    "published_sizes": (mesh_stage, dict(resolution=80, size=1024)),
-}
-
-
-def main() -> int:
-    device = torch.device("cpu")
-    known = random_field(device)
-    stages(known, 32, 512)
-    sys.stdout.write(
-        f"{'resolution':>10s} {'texture':>8s} {'surface':>9s} {'textures':>9s} {'glb':>9s} {'all, ms':>9s}\n"
-    )
-    for resolution, size in ((32, 1024), (80, 1024), (128, 1024), (256, 1024), (80, 512), (80, 2048), (80, 4096)):
-        best = None
-        for _ in range(3 if resolution < 256 and size < 4096 else 1):
-            found = stages(known, resolution, size)
-            best = found if best is None or sum(found.values()) < sum(best.values()) else best
-        row = " ".join(f"{1e3 * s:9.1f}" for s in (*best.values(), sum(best.values())))
-        sys.stdout.write(f"{resolution:10d} {size:8d} {row}\n")
-        sys.stdout.flush()
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+CASES = {"published_sizes": (mesh_stage, dict(resolution=80, size=1024))}

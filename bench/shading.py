@@ -4,9 +4,8 @@ Mitsuba renders its ``principled`` material with as many samples a pixel in two 
 BSDF): the same amount of work, not the same estimator.  Both sides trace primary rays, without a film.  Gradients: of
 the sum of the image with respect to one base color and all texels of the map.
 
-``python -m bench.shading`` also prints, beyond the cases: variance of the image and its gradients at equal samples, of
-one formula on both sides, and the ratio of times at equal variance; memory a pixel; time over pixels, samples and
-triangles; how near the device's peak is.
+``python -m bench.shading`` prints the variance of the image and its gradients at equal samples, of one formula on both
+sides, and the ratio of times at equal variance.
 """
 
 import sys
@@ -30,8 +29,8 @@ from reli3d.render.silhouette import antialias, mesh_edges
 SAMPLES = (20, 40, 4)  # the published counts: 64
 
 
-def geometry(subdivisions=6):
-    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.8)
+def geometry():
+    mesh = trimesh.creation.icosphere(subdivisions=6, radius=0.8)
     return mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
 
 
@@ -45,9 +44,9 @@ def sky(device):
     return torch.rand(64, 128, 3, generator=torch.Generator().manual_seed(0)).to(device)
 
 
-def direct(device, size, roughness, backward, samples=SAMPLES, subdivisions=6):
+def direct(device, size, roughness, backward):
     """Primary rays and 64 samples with shadow rays per hit, with gradients to material and light if ``backward``."""
-    vertices, faces = (torch.from_numpy(a).to(device) for a in geometry(subdivisions))
+    vertices, faces = (torch.from_numpy(a).to(device) for a in geometry())
     scene, camera = RayScene(vertices, faces), view(device, size)
     origins, directions = (v.reshape(-1, 3) for v in camera_rays(camera))
     hit = int((scene.closest(origins, directions).face >= 0).sum())
@@ -63,10 +62,10 @@ def direct(device, size, roughness, backward, samples=SAMPLES, subdivisions=6):
         position = origins[index] + directions[index] * found.t[index, None]
         normal = torch.nn.functional.normalize(position, dim=-1)
         points = SurfacePoints(position, normal, normal, base.expand(n, 3), roughness, 0.0)
-        out = shade(points, wo, environment, scene=scene, options=ShadeOptions(samples=samples, seed=seed))
+        out = shade(points, wo, environment, scene=scene, options=ShadeOptions(samples=SAMPLES, seed=seed))
         return torch.autograd.grad(out.sum(), (base, light)) if backward else out
 
-    return step, {"samples": hit * sum(samples)}
+    return step, {"samples": hit * sum(SAMPLES)}
 
 
 def mitsuba_direct(device, size, roughness, backward, formula=None):
@@ -209,61 +208,5 @@ def equal_variance(write) -> None:
             )
 
 
-# Floating-point operations of a sample above the horizon in ``reli3d.kernels.shade``, counted by hand from the source:
-# sums, products, quotients, roots, minima, roundings, one each; no integers (random numbers, table search), no choices.
-OPERATIONS = {
-    "direction and place on the map": 132,  # table 102, visible normal 148, cosine 121; 20:40:4
-    "facet and GGX": 38,
-    "densities and weight": 21,
-    "light": 37,
-    "material": 89,
-    "value and sum": 14,
-}
-HIT_BYTES = 84  # seven inputs and a counter read, radiance written, once; tables and a small map stay in caches
-
-
-def floor(device, write) -> None:
-    """Print the fused kernel's fraction of the device's peaks, which torch measures in the same run.
-
-    Without shadow rays, whose traversal is not counted.  A sample below the horizon does less than is counted for it.
-    """
-    n, g = 1 << (14 if device.type == "cpu" else 19), torch.Generator().manual_seed(0)
-    normal = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=-1).to(device)
-    environment = Environment(sky(device))
-    square, block = torch.rand(2048, 2048, generator=g).to(device), torch.zeros(1 << 26, device=device)
-    into = torch.empty_like(block)
-    points = SurfacePoints(normal, normal, normal, normal.abs(), 0.4, 0.4)
-    steps = [lambda: shade(points, normal, environment), lambda: square @ square, lambda: into.copy_(block)]
-    kernel, product, copy = (t.median for t in time_steps(steps, device, seconds=2.0))
-    rate, width = 2 * 2048**3 / product, 2 * 4 * block.numel() / copy
-    count = sum(OPERATIONS.values())
-    took, least, read = (1e9 * v for v in (kernel / (n * 64), count / rate, HIT_BYTES / 64 / width))
-    write(
-        f"fused kernel on {device.type}, 64 samples, no shadows: {took:.3g} ns a sample, {count / took:.3g} GFLOP/s; "
-        f"floor {least:.3g} ns by {count} operations at {rate / 1e9:.0f} GFLOP/s (float32 matrix product), "
-        f"{read:.3g} ns by {HIT_BYTES / 64:.1f} bytes at {width / 1e9:.0f} GB/s (copy): "
-        f"{max(least, read) / took:.1%} of it\n"
-    )
-
-
-def study() -> None:
-    """Print the floor, variance, memory and growth; all but the floor on CPU."""
-    device, write = torch.device("cpu"), sys.stdout.write
-    for kind in ["cpu"] + ["cuda"] * torch.cuda.is_available():
-        floor(torch.device(kind), write)
-    equal_variance(write)
-    base = dict(size=128, roughness=0.4, backward=False)
-    changes = [{}, {"size": 256}, {"size": 512}, {"samples": (5, 10, 1)}, {"samples": (80, 160, 16)}]
-    changes += [{"subdivisions": 4}, {"subdivisions": 7}, {"backward": True}, {"backward": True, "size": 256}]
-    for change in changes:
-        step, work = direct(device, **{**base, **change})
-        timing = time_steps([step], device, seconds=1.0)[0]
-        rate, pixels = work["samples"] / timing.median / 1e6, change.get("size", base["size"]) ** 2
-        write(
-            f"{change or 'the case'}: {1e3 * timing.median:.1f} ms, {rate:.2f} M samples/s, "
-            f"{timing.peak_bytes / pixels:.0f} bytes a pixel\n"
-        )
-
-
 if __name__ == "__main__":
-    study()
+    equal_variance(sys.stdout.write)

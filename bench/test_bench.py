@@ -9,9 +9,7 @@ import json
 
 import pytest
 
-from bench import official
 from bench.run import BASELINE, collect, kind, line, measure
-from reli3d.nn.presets import OFFICIAL
 
 TOLERANCE = 1.5  # other work on the machine moved a ratio of medians by up to 1.25 between runs; a lost factor is 2
 ELSEWHERE = 3.0  # of the worst recorded: an AMD with AVX2 took 1.5 times the ratio of an Intel with AVX-512; twice that
@@ -56,10 +54,3 @@ def test_a_kind_without_a_ratio_is_held_to_the_looser_bound_by_the_worst_of_the_
     assert bound(recorded, "b", "y") == ELSEWHERE * 1.0 and bound(recorded, "c", "x") == ELSEWHERE * 0.3
     with pytest.raises(AssertionError, match="bench.run --record z"):
         bound(recorded, "a", "z")
-
-
-def test_counted_operations_are_those_of_the_specified_sizes():
-    """Sums of the same products: the counter's and the closed forms' of the specification."""
-    for views in (1, 4):
-        assert official.counted(OFFICIAL, views) == pytest.approx(official.specified_flops(OFFICIAL, views), rel=1e-9)
-    assert official.parameters(OFFICIAL) == official.SPECIFIED

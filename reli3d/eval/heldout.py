@@ -5,6 +5,7 @@ baseline; and the error of the environment, with that of the mean training envir
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import primary_hits, surface_points
 from reli3d.render.latlong import quarter_turn
+from reli3d.render.points import SurfacePoints
 from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.samples import ObjectSurface
 from reli3d.train.batches import stored_views
@@ -30,29 +32,17 @@ MAX_MASK_DIFFERENCE = 0.02  # fraction of the pixels of a view; samples of the s
 BLACK = 0.01  # added to radiance before the logarithm
 
 
-def reference_colors(seed: int, cameras: list[Camera]) -> list[tuple[Tensor, Tensor]]:
-    """Coverage ``(H, W)`` bool and base color ``(H, W, 3)``, sRGB-encoded, of the object of ``seed`` in each
-    camera.
-    """
-    surface = ObjectSurface(make_object(seed))
-    color_at = lambda face, bary: surface.points_at(face.long(), bary).base_color.clamp(0, 1)  # noqa: E731
-    return [_seen_colors(surface.scene, camera, color_at) for camera in cameras]
-
-
-def asset_colors(asset, scene: RayScene, camera: Camera) -> tuple[Tensor, Tensor]:
-    """As :func:`reference_colors`, of a reconstruction in one camera."""
-    color_at = lambda face, bary: surface_points(asset.mesh, asset.textures, face, bary).base_color  # noqa: E731
-    return _seen_colors(scene, camera, color_at)
-
-
-def _seen_colors(
-    scene: RayScene, camera: Camera, color_at: Callable[[Tensor, Tensor], Tensor]
+def seen_colors(
+    scene: RayScene, camera: Camera, points_at: Callable[[Tensor, Tensor], SurfacePoints]
 ) -> tuple[Tensor, Tensor]:
-    """``color_at``: linear base color at faces and barycentric coordinates."""
+    """Coverage ``(H, W)`` bool and base color ``(H, W, 3)``, sRGB-encoded.
+
+    points_at: surface points at faces and barycentric coordinates.
+    """
     hits, _, _ = primary_hits(scene, camera)
     seen = hits.face >= 0
     color = torch.zeros(*seen.shape, 3, dtype=torch.float32, device="cpu")
-    color[seen] = linear_to_srgb(color_at(hits.face[seen], hits.bary[seen]))
+    color[seen] = linear_to_srgb(points_at(hits.face[seen], hits.bary[seen]).base_color.clamp(0, 1))
     return seen, color
 
 
@@ -96,15 +86,16 @@ def evaluate(
     except NoSurface:
         return {"empty": 1.0, "iou": 0.0}
     scene, size = RayScene(asset.mesh.vertices, asset.mesh.faces), sample["images"].shape[1]
-    chosen = range(last - HELD_OUT_VIEWS, last)
-    cameras = [Camera(sample["c2w"][i], sample["intrinsics"][i], size, size) for i in chosen]
+    original = ObjectSurface(make_object(seed))
     ious, result_all, reference_all = [], [], []
-    for i, camera, (mask, reference) in zip(chosen, cameras, reference_colors(seed, cameras), strict=True):
+    for i in range(last - HELD_OUT_VIEWS, last):
+        camera = Camera(sample["c2w"][i], sample["intrinsics"][i], size, size)
+        mask, reference = seen_colors(original.scene, camera, lambda face, bary: original.points_at(face.long(), bary))
         if float((mask ^ (sample["images"][i, ..., 3] > 127)).float().mean()) > MAX_MASK_DIFFERENCE:
             raise InputError("samples", f"expected procedural objects, got another object in the sample of seed {seed}")
-        result_mask, result = asset_colors(asset, scene, camera)
-        ious.append(float((mask & result_mask).sum() / (mask | result_mask).sum().clamp(min=1)))
+        result_mask, result = seen_colors(scene, camera, partial(surface_points, asset.mesh, asset.textures))
         both = mask & result_mask
+        ious.append(float(both.sum() / (mask | result_mask).sum().clamp(min=1)))
         result_all.append(result[both])
         reference_all.append(reference[both])
     result, reference = torch.cat(result_all), torch.cat(reference_all)

@@ -4,6 +4,8 @@ Geometry is compared in the frame of the reference, scaled so that its longest s
 display values (sRGB in [0, 1]) over black, including the background.
 """
 
+from functools import partial
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -63,9 +65,7 @@ def ssim(result: Tensor, reference: Tensor) -> float:
     line = torch.exp(-at.square() / (2.0 * SIGMA**2))
     kernel = (line[:, None] * line)[None, None] / line.sum() ** 2
 
-    def mean(x: Tensor) -> Tensor:
-        return conv2d(x, kernel)
-
+    mean = partial(conv2d, weight=kernel)
     a, b = (x.double().movedim(-1, 0)[:, None] for x in (result.cpu(), reference.cpu()))
     ma, mb = mean(a), mean(b)
     va, vb, both = mean(a * a) - ma * ma, mean(b * b) - mb * mb, mean(a * b) - ma * mb

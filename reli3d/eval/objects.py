@@ -60,14 +60,11 @@ def load_reference(
     points = torch.cat([p.mesh.vertices for p in parts])
     low, high = points.amin(0), points.amax(0)
     scale = 1.0 / float((high - low).max())
-    moved = [
-        replace(p, mesh=replace(p.mesh, vertices=((p.mesh.vertices - (low + high) / 2) * scale).contiguous()))
-        for p in parts
-    ]
-    c2w, fov = sample_cameras(np.random.default_rng((seed, 5)), inputs + HELD_OUT_VIEWS)
-    cameras = [
-        Camera.from_fov(torch.as_tensor(m, device="cpu"), float(f), size, size) for m, f in zip(c2w, fov, strict=True)
-    ]
+    vertices = [((p.mesh.vertices - (low + high) / 2) * scale).contiguous() for p in parts]
+    moved = [replace(p, mesh=replace(p.mesh, vertices=v)) for p, v in zip(parts, vertices, strict=True)]
+    drawn = sample_cameras(np.random.default_rng((seed, 5)), inputs + HELD_OUT_VIEWS)
+    poses = [(torch.as_tensor(c2w, device="cpu"), float(fov)) for c2w, fov in zip(*drawn, strict=True)]
+    cameras = [Camera.from_fov(c2w, fov, size, size) for c2w, fov in poses]
     return ReferenceObject(path.stem, moved, light, other, cameras)
 
 
@@ -101,21 +98,14 @@ def exposure_of(target: ReferenceObject, light: Environment) -> float:
 def input_views(target: ReferenceObject, count: int, hero: int, exposure: float) -> Views:
     """Rendered input views: the first ``count`` cameras, the reference view ``hero`` first."""
     order = [hero, *(k for k in range(count) if k != hero)]
-    images, masks = [], []
-    for k in order:
-        options = ShadeOptions(samples=SAMPLES, seed=3)
-        given = target.parts, target.cameras[k], target.light
-        rendering = render_asset(*given, options=options, background="environment", supersampling=2)
-        images.append(linear_to_srgb((rendering.radiance * exposure).clamp(0.0, 1.0)))
-        masks.append(rendering.alpha)
-    cameras = [target.cameras[k] for k in order]
-    return Views(
-        tuple(images),
-        tuple(masks),
-        torch.stack([c.c2w for c in cameras]),
-        torch.stack([c.intrinsics for c in cameras]),
-        tuple(f"{k:04d}" for k in order),
-    )
+    cameras, options = [target.cameras[k] for k in order], ShadeOptions(samples=SAMPLES, seed=3)
+    renderings = [
+        render_asset(target.parts, camera, target.light, options=options, background="environment", supersampling=2)
+        for camera in cameras
+    ]
+    images = tuple(linear_to_srgb((r.radiance * exposure).clamp(0.0, 1.0)) for r in renderings)
+    c2w, intrinsics = torch.stack([c.c2w for c in cameras]), torch.stack([c.intrinsics for c in cameras])
+    return Views(images, tuple(r.alpha for r in renderings), c2w, intrinsics, tuple(f"{k:04d}" for k in order))
 
 
 @torch.no_grad()
@@ -143,8 +133,9 @@ def evaluate(
         mesh = joined([p.mesh for p in target.parts])
         found |= geometry(surface_samples(asset.mesh), surface_samples(mesh, seed=1))
     for name in ("image", "relit", *MAPS):
-        found[f"{name}_psnr"] = float(np.mean([psnr(g[name], w[name]) for g, w in zip(result, reference, strict=True)]))
-        found[f"{name}_ssim"] = float(np.mean([ssim(g[name], w[name]) for g, w in zip(result, reference, strict=True)]))
+        for metric in (psnr, ssim):
+            values = [metric(g[name], w[name]) for g, w in zip(result, reference, strict=True)]
+            found[f"{name}_{metric.__name__}"] = float(np.mean(values))
     names = ("image", "relit", "base_color")
     return found, [views.images[0], *(x[n] for n in names for x in (reference[0], result[0]))]
 
@@ -206,8 +197,6 @@ def table(
             rows.append({"object": target.name, "views": count, **found})
             progress(f"{target.name}, {count} views: " + ", ".join(f"{n} {v:.3f}" for n, v in found.items()))
         rows_of_images.append(shown)
-    of = {
-        str(c): [{n: v for n, v in r.items() if n not in ("object", "views")} for r in rows if r["views"] == c]
-        for c in counts
-    }
-    return {label: summary(scores) for label, scores in of.items()}, rows, sheet(rows_of_images)
+    scores = [({n: v for n, v in row.items() if n not in ("object", "views")}, row["views"]) for row in rows]
+    means = {str(c): summary([score for score, views in scores if views == c]) for c in counts}
+    return means, rows, sheet(rows_of_images)

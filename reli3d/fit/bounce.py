@@ -23,12 +23,11 @@ RAY_OFFSET = 1e-3  # of ray origins along the normal: 1/15 of a cell at 128 cell
 def gathered(mesh: Mesh, images: InputImages, *, seed: int) -> Tensor:
     """Cosine-weighted mean ``(V, 3)`` of the radiance that each vertex receives from the mesh itself.
 
-    Final gathering with one bounce: a surface point is taken as Lambertian, and its outgoing radiance, which includes
-    all bounces, is the mean color of the images in which it is visible.  Points that no camera sees get the mean of the
-    other points.  Faces emit on both sides.
+    Final gathering: the outgoing radiance of a surface point, taken as Lambertian, is the mean color of the images in
+    which it is visible, else the mean of the other points.  Faces emit on both sides.
 
     mesh: with normals, in the fit's box [-1, 1]^3.  images: input images whose colors may be used; exposures are taken
-    as 1.  seed: random seed of the ray directions.  No gradient.  Raises ValueError without normals.
+    as 1.  seed: of the ray directions.  No gradient.  Raises ValueError without normals.
     """
     position, normal = mesh.vertices, present("mesh.normals", mesh.normals)
     scene = RayScene(position, mesh.faces)
@@ -40,10 +39,8 @@ def gathered(mesh: Mesh, images: InputImages, *, seed: int) -> Tensor:
     rng = torch.Generator().manual_seed(seed)
     parts = []
     for at, n in zip(position.split(VERTICES_PER_BATCH), normal.split(VERTICES_PER_BATCH), strict=True):
-        ball = unit(torch.randn(len(n), RAYS_PER_VERTEX, 3, generator=rng, dtype=torch.float32, device="cpu")).to(
-            n.device
-        )
-        directions = unit(n[:, None] + ball)  # their density is the cosine over pi
+        ball = torch.randn(len(n), RAYS_PER_VERTEX, 3, generator=rng, dtype=torch.float32, device="cpu")
+        directions = unit(n[:, None] + unit(ball).to(n.device))  # their density is the cosine over pi
         face = scene.closest((at + RAY_OFFSET * n)[:, None], directions).face.long()
         parts.append((of_face[face.clamp(min=0)] * (face >= 0)[..., None]).mean(1))
     return torch.cat(parts)

@@ -89,10 +89,9 @@ class Fitted:
 class ViewRenderer:
     """Renders one surface in all views at low resolution and compares with the input images; rays are traced once.
 
-    received: ``(vertices, 3)``, from :func:`~reli3d.fit.bounce.gathered`.  For V views: ``target (V, S, S, 3)`` display
-    values on white; ``photographed (V, S, S)``: of the images; ``rays``: hit mask ``(S, S)``, faces ``(N,)``,
-    barycentrics ``(N, 2)`` and unit directions to the eye ``(N, 3)``; ``inside (N,)``: whether the hit is at least one
-    pixel inside the mask.
+    received: ``(vertices, 3)``, from :func:`~reli3d.fit.bounce.gathered`.  target: ``(V, S, S, 3)`` display values on
+    white.  rays: for each view, hit mask ``(S, S)``, faces ``(N,)``, barycentrics ``(N, 2)`` and unit directions to the
+    eye ``(N, 3)``.  inside: for each view ``(N,)``, whether the hit is at least one pixel inside the mask.
     """
 
     @torch.no_grad()
@@ -136,10 +135,7 @@ class ViewRenderer:
 
     @torch.no_grad()
     def light_scale(self, lit: list[tuple[Tensor, Tensor]], views: list[int]) -> float:
-        """Value of ``LIGHT_SCALES`` with the least error in ``views``, over pixels inside the masks.
-
-        Pixels at the rim are excluded because they contain background.
-        """
+        """Value of ``LIGHT_SCALES`` with the least error in ``views``, over pixels inside the masks."""
         got, bounced = (torch.cat([lit[view][k][self.inside[view]] for view in views]) for k in range(2))
         target = torch.cat([self.target[view][self.rays[view][0]][self.inside[view]] for view in views])
         if not len(got):
@@ -172,12 +168,11 @@ def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> 
 
     used, held: indices of views.  before: errors ``(V,)`` of the start.  A candidate is accepted if its mean PSNR is at
     most ``PSNR_TOLERANCE_DB`` (``SURFACE_TOLERANCES_DB`` if only the surface changes) below the start's on the ``used``
-    views, on the ``held`` views and on all views; if none is, the start is returned.  ``MIN_VIEWS_FULL_WEIGHT`` limits
-    the weights.
+    views, on the ``held`` views and on all views; if none is, the start is returned.
 
-    Each candidate's light scale is fitted to the used views, because the fit underestimates the lighting: the loss uses
-    the tangent of the display curve, which rises faster than the curve, and a blend of log radiance is darker than a
-    blend of radiance.
+    Each candidate's light scale is fitted to the used views, because the fit underestimates the lighting: the tangent
+    of the display curve in the loss rises faster than the curve, and a blend of log radiance is darker than one of
+    radiance.
     """
     renderer = ViewRenderer(fitted.surface, fitted.received, fitted.images)
     moved = float(fitted.surface is not fitted.first)

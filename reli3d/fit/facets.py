@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from reli3d.fit.unknowns import unit
 from reli3d.geometry.mesh import Mesh
@@ -12,16 +11,6 @@ from reli3d.geometry.topology import face_neighbors
 NORMAL_SIGMA = 0.2  # standard deviation of the range kernel: distance of unit normals, 11 degrees
 NORMAL_ITERATIONS = 10  # of the filter of the normals; its support in faces
 VERTEX_ITERATIONS = 20  # that move the vertices towards their faces' planes
-
-
-def neighbor_faces(faces: Tensor) -> Tensor:
-    """Face ``(F, 3)`` int64 across each edge ``(0, 1), (1, 2), (2, 0)`` of ``faces (F, 3)``.
-
-    An edge without exactly one face across it gives the face itself.
-    """
-    across = torch.from_numpy(face_neighbors(faces.cpu().numpy())).to(faces.device).long()
-    own = torch.arange(len(faces), device=faces.device, dtype=torch.int64)[:, None]
-    return torch.where(across < 0, own, across)
 
 
 @torch.no_grad()
@@ -33,7 +22,10 @@ def flattened(mesh: Mesh) -> Mesh:
     (Sun, Rosin, Martin and Langbein 2007, Fast and effective feature-preserving mesh denoising, section 4).  Unlike
     smoothing of positions, this keeps sharp edges and the thickness of thin parts.
     """
-    vertices, corners, across = mesh.vertices.detach(), mesh.faces.long(), neighbor_faces(mesh.faces)
+    vertices, corners = mesh.vertices.detach(), mesh.faces.long()
+    across = torch.from_numpy(face_neighbors(mesh.faces.cpu().numpy())).to(corners)
+    own = torch.arange(len(corners), device=corners.device, dtype=torch.int64)[:, None]
+    across = torch.where(across < 0, own, across)  # an edge without exactly one face across it gives the face itself
     a, b, c = (vertices.index_select(0, k) for k in corners.unbind(1))
     doubled = torch.linalg.cross(b - a, c - a)
     area = doubled.norm(dim=1, keepdim=True)

@@ -21,28 +21,18 @@ INSIDE_COVERAGE = 0.99  # minimum of a pixel and its neighbors that contain only
 class PosedImages(Protocol):
     """Batch of posed images, such as :meth:`reli3d.views.views.Views.resampled` returns.
 
-    It may also have ``silhouettes (V, S, S)``: the masks, continued beyond the border of the photographs.
+    images: ``(V, S, S, 3)`` sRGB in [0, 1].  masks: ``(V, S, S)`` in [0, 1].  c2w: ``(V, 4, 4)``.  intrinsics: ``(V,
+    4)``.  It may also have ``silhouettes (V, S, S)``: the masks, continued beyond the border of the photographs.
     """
 
     @property
-    def images(self) -> Tensor:
-        """``(V, S, S, 3)`` sRGB in [0, 1]."""
-        ...
-
+    def images(self) -> Tensor: ...
     @property
-    def masks(self) -> Tensor:
-        """``(V, S, S)`` in [0, 1]."""
-        ...
-
+    def masks(self) -> Tensor: ...
     @property
-    def c2w(self) -> Tensor:
-        """``(V, 4, 4)``."""
-        ...
-
+    def c2w(self) -> Tensor: ...
     @property
-    def intrinsics(self) -> Tensor:
-        """``(V, 4)``."""
-        ...
+    def intrinsics(self) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -78,21 +68,15 @@ class InputImages:
         images, masks = views.images, views.masks
         silhouettes = getattr(views, "silhouettes", None)
         silhouettes = masks if silhouettes is None else silhouettes
-        check("images", images, last=3)
-        check("masks", masks, like=images)
-        check("silhouettes", silhouettes, like=images)
-        check("c2w", views.c2w, last=4, like=images)
-        check("intrinsics", views.intrinsics, last=4, like=images)
-        count = len(images)
-        if images.ndim != 4 or not count or images.shape[1] != images.shape[2]:
+        check("images", images, shape=("V", "S", "S", 3))
+        count, size = images.shape[:2]
+        if not count or images.shape[2] != size:
             raise ValueError(f"images: expected (V, S, S, 3) with at least one view, got {tuple(images.shape)}")
         for name, value in (("masks", masks), ("silhouettes", silhouettes)):
-            if value.shape != images.shape[:3]:
-                raise ValueError(f"{name}: expected {tuple(images.shape[:3])}, got {tuple(value.shape)}")
-        if views.c2w.shape != (count, 4, 4) or views.intrinsics.shape != (count, 4):
-            got = f"{tuple(views.c2w.shape)} and {tuple(views.intrinsics.shape)}"
-            raise ValueError(f"c2w, intrinsics: expected {count} cameras, got {got}")
-        camera = Camera(views.c2w, views.intrinsics, *images.shape[2:0:-1]).detach()
+            check(name, value, shape=(count, size, size), like=images)
+        check("c2w", views.c2w, shape=(count, 4, 4), like=images)
+        check("intrinsics", views.intrinsics, shape=(count, 4), like=images)
+        camera = Camera(views.c2w, views.intrinsics, size, size).detach()
         group: tuple[int, ...] = ()
         if not isinstance(light, str):
             numbers = {g: k for k, g in enumerate(dict.fromkeys(light))}

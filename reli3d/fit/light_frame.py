@@ -34,11 +34,11 @@ def light_follows_camera(mesh: Mesh, images: InputImages) -> bool:
 def explained_deviations(mesh: Mesh, images: InputImages) -> tuple[float, float]:
     """Standard deviations of log brightness over a point's views, explained by camera-fixed and object-fixed lighting.
 
-    Under lighting fixed to the camera, the log radiance of a diffuse point varies as a function of the normal in camera
-    axes; under lighting fixed to the object, the log radiance of a glossy point varies as a function of the reflected
-    direction in object axes.  Each function is a sum of spherical harmonics of degree 1 and 2, fitted by weighted least
-    squares (visibility, viewing angle) together with a constant for each point and each view (albedo, exposure).  The
-    explained deviation is the square root of the variance that the function removes.
+    Under lighting fixed to the camera, log radiance is fitted as a function of the normal in camera axes (diffuse
+    points); under lighting fixed to the object, as one of the reflected direction in object axes (glossy points).  Each
+    function is a sum of spherical harmonics of degree 1 and 2, fitted by weighted least squares (visibility, viewing
+    angle) with a constant for each point and each view (albedo, exposure).  The explained deviation is the square root
+    of the variance that the function removes.
 
     mesh: with normals.  No gradient.
     """

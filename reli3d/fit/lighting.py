@@ -42,12 +42,6 @@ class Lights:
         world = lat_long_directions(height, width).to(self.maps)
         return Environment(light.lookup((world @ self.c2w[view, :3, :3]).contiguous()))
 
-    def distinct(self) -> list[list[int]]:
-        """Groups of views with equal lighting."""
-        if self.c2w is not None:
-            return [[view] for view in range(len(self.group))]
-        return [[v for v, g in enumerate(self.group) if g == k] for k in dict.fromkeys(self.group)]
-
     def evaluate(
         self,
         points: SurfacePoints,
@@ -56,16 +50,12 @@ class Lights:
         radiance: Callable[[SurfacePoints, Tensor, Environment], Tensor],
     ) -> Tensor:
         """``radiance(points, wo, environment)``, ``(N, 3)``, each row under the lighting of its view ``view (N,)``."""
-        views = self.distinct()
-        if len(views) == 1:
-            return radiance(points, wo, self.of_view(views[0][0]))
-        kind = torch.zeros(len(self.group), dtype=torch.long, device=view.device)
-        for k, members in enumerate(views):
-            kind[members] = k
-        kind = kind[view]
+        group = range(len(self.group)) if self.c2w is not None else self.group
+        first = torch.tensor([group.index(g) for g in group], device=view.device)  # view with the same lighting
+        if len(set(group)) == 1:
+            return radiance(points, wo, self.of_view(0))
         out = wo.new_zeros(wo.shape)
-        for k in torch.unique(kind).tolist():
-            rows = torch.nonzero(kind == k)[:, 0]
-            shaded = radiance(points[rows], wo[rows], self.of_view(views[k][0]))
-            out = out.index_copy(0, rows, shaded)
+        for k in torch.unique(first[view]).tolist():
+            rows = torch.nonzero(first[view] == k)[:, 0]
+            out = out.index_copy(0, rows, radiance(points[rows], wo[rows], self.of_view(k)))
         return out

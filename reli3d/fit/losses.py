@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from reli3d.fit.unknowns import Unknowns, light_maps
-from reli3d.geometry.grid import squared_laplacian
 
 MIN_LINEAR = 0.02  # linear radiance below which the display's derivative is constant: there images contain mostly noise
 HUBER_DELTA = 0.25  # display values; larger residuals count linearly: reflected surroundings, glare, wrong masks
@@ -27,7 +26,7 @@ class Weights:
     outline: float = 30.0  # of :func:`outline`
     agreement: float = 0.3  # of :func:`agreement`
     shading: float = 30.0  # of :func:`display_error` while the surface is fitted
-    curvature: float = 0.5  # of :func:`curvature`
+    curvature: float = 0.5  # of the squared Laplacian of the signed distance, where silhouettes and colors say little
     sdf_change: float = 2e-3  # of the squared change of the signed distance; divided by the number of views
     image: float = 1.0  # of :func:`display_error` in the fit of the maps and the lighting
     palette: float = 0.01  # of :func:`palette`
@@ -68,8 +67,7 @@ def agreement(color: Tensor, weight: Tensor) -> Tensor:
     """Photo-consistency: weighted variance of a point's color over the views, robust, mean over points.
 
     color: ``(N, V, 3)`` display values at the projections of each point.  weight: ``(N, V)``, 0 where it is occluded.
-    Except in highlights, a point on the true surface has the same color in all views.  The term needs neither lighting
-    nor material, so it is used before these are fitted.  Points visible in fewer than two views do not count.
+    The term needs neither lighting nor material.  Points visible in fewer than two views do not count.
     """
     total = weight.sum(1)
     valid = (weight > 0.0).sum(1) >= 2
@@ -79,15 +77,6 @@ def agreement(color: Tensor, weight: Tensor) -> Tensor:
     variance = AGREEMENT_SIGMA**2
     robust = variance * (1.0 - torch.exp(-square / (2.0 * variance)))  # bounded: outliers have no gradient
     return ((weight * robust).sum(1) * valid).sum() / valid.sum().clamp(min=1) / variance
-
-
-def curvature(sdf: Tensor, cell: float, weight: Tensor) -> Tensor:
-    """Weighted sum of the squared Laplacian of the signed distance, in cells.
-
-    sdf, weight: ``(X, Y, Z)``.  cell: side of a cell.  The term regularizes the surface where silhouettes and colors
-    do not constrain it.
-    """
-    return squared_laplacian(sdf, weight) / (cell * cell)
 
 
 def total_variation(values: Tensor) -> Tensor:
@@ -103,9 +92,9 @@ def near_start(grids: Sequence[Tensor]) -> Tensor:
 def near_base_color(change: Tensor, weights: Weights, views: int) -> Tensor:
     """Robust prior that pulls the base color to the start, mean over points; change: ``(N, 3)`` in logits.
 
-    Few views constrain normals and lighting poorly, and the residual shading would be baked into the base color as a
-    small change at most points.  Correcting a wrong initial color needs a large change, so the gradient decreases above
-    ``BASE_COLOR_SCALE``.  The weight is divided by ``views**4``: 0.25 at 3 views and 5e-4 at 14.
+    With few views, residual shading would be baked into the base color as a small change at most points; a wrong
+    initial color needs a large change, so the gradient decreases above ``BASE_COLOR_SCALE``.  The weight is divided by
+    ``views**4``: 0.25 at 3 views and 5e-4 at 14.
     """
     square = change.square().mean(1)
     return weights.base_color / views**4 * (square / (1.0 + square / (BASE_COLOR_SCALE * BASE_COLOR_SCALE))).mean()
@@ -131,9 +120,8 @@ def hue_drift(color: Tensor, start: Tensor) -> Tensor:
     """Squared change of the object's mean chromaticity, in log base color.
 
     color, start: ``(N, 3)`` logarithms of base color at the same points.  A factor per channel is ambiguous between
-    base color and lighting: a red object under white light looks like a white one under red light.  The start,
-    predicted from learned priors, resolves this ambiguity.  Brightness is not constrained, because the start's is often
-    wrong.
+    base color and lighting; the start, predicted from learned priors, resolves this.  Brightness is not constrained,
+    because the start's is often wrong.
     """
     drift = (color - start).mean(0)
     return (drift - drift.mean()).square().mean()

@@ -47,15 +47,6 @@ class FixedSurface:
 
 
 @dataclass(frozen=True)
-class MapsStage:
-    """A part of a fit on a fixed surface."""
-
-    name: str
-    until: float  # fraction of the budget used at its end
-    detail: bool = True  # fit the texture detail and the bend of the normals as well
-
-
-@dataclass(frozen=True)
 class Pixels:
     """Pixels inside the masks and the surface points visible there; N rows."""
 
@@ -106,24 +97,23 @@ def traced(data: FixedSurface, scene: RayScene, seed: int) -> Pixels:
     return Pixels(which, at.position, at.normal, at.ng, wo, uv, material_logits(at), target, received, order)
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """Parameters of the shading estimate in one step.
-
-    scene: occluders; None: no shadows.  samples: counts of light, BSDF and cosine samples.  seed: random seed.
-    independent: use two independent estimates, for an unbiased gradient; False: the gradient of the returned loss.
-    """
-
-    scene: RayScene | None
-    samples: tuple[int, int, int]
-    seed: int
-    independent: bool = True
-
-
 def maps_loss(
-    unknowns: Unknowns, data: FixedSurface, pixels: Pixels, rows: Tensor, weights: losses.Weights, estimate: Estimate
+    unknowns: Unknowns,
+    data: FixedSurface,
+    pixels: Pixels,
+    rows: Tensor,
+    weights: losses.Weights,
+    *,
+    scene: RayScene | None,
+    samples: tuple[int, int, int],
+    seed: int,
+    independent: bool = True,
 ) -> Tensor:
-    """Loss of one step over ``rows`` of the pixels; gradients reach material, detail, bend, light and exposure."""
+    """Loss of one step over ``rows`` of the pixels; gradients reach material, detail, bend, light and exposure.
+
+    scene, samples: of :func:`~reli3d.fit.shading.radiance`.  seed: of the light samples.  independent: as in
+    :func:`~reli3d.fit.shape.shape_loss`.
+    """
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
     detail = sample_texture(unknowns.detail, pixels.uv[rows])
     change = material_change(unknowns, position)
@@ -133,19 +123,18 @@ def maps_loss(
     lights, exposure = Lights.of(unknowns, data.start, data.images), unknowns.exposure.exp()[view, None]
 
     def lit(seed: int) -> Tensor:
-        shading = partial(radiance, samples=estimate.samples, scene=estimate.scene, seed=seed)
+        shading = partial(radiance, samples=samples, scene=scene, seed=seed)
         return lights.evaluate(points, pixels.wo[rows], view, shading)
 
     bounced = reflected(points, pixels.received[rows])
-    image = (bounced + lit(2 * estimate.seed)) * exposure
+    image = (bounced + lit(2 * seed)) * exposure
     other = image
-    if estimate.independent:
+    if independent:
         with torch.no_grad():
-            other = (bounced + lit(2 * estimate.seed + 1)) * exposure
+            other = (bounced + lit(2 * seed + 1)) * exposure
     loss = weights.image * losses.display_error(image, other, target, target > SATURATED_LINEAR)
-    color, was = (
-        c.clamp(min=losses.MIN_LINEAR).log() for c in (points.base_color, material_of(pixels.logits[rows])[0])
-    )
+    colors = points.base_color, material_of(pixels.logits[rows])[0]
+    color, was = (c.clamp(min=losses.MIN_LINEAR).log() for c in colors)
     loss = loss + weights.palette * losses.palette(color, target) + weights.hue * losses.hue_drift(color, was)
     loss = loss + losses.priors(unknowns, weights, len(data.used))
     loss = loss + losses.near_base_color(change[:, :3], weights, len(data.used))
@@ -162,9 +151,19 @@ def fading(progress: float, settled: bool) -> float:
 
 
 def fit_maps(
-    unknowns: Unknowns, data: FixedSurface, weights: losses.Weights, budget: Budget, stage: MapsStage, *, seed: int
+    unknowns: Unknowns,
+    data: FixedSurface,
+    weights: losses.Weights,
+    budget: Budget,
+    name: str,
+    until: float,
+    *,
+    seed: int,
+    detail: bool = True,
 ) -> None:
     """Fits lighting, exposures and material on a fixed surface, coarse to fine.
+
+    name, until: of the budget's part.  detail: fit the texture detail and the bend of the normals as well.
 
     Errors of normals, shadows and interreflection would be baked into the base color.  While the material is fitted, a
     weakly regularized bend of the shading normals absorbs these errors.  Then the material is frozen, and the bend is
@@ -175,7 +174,7 @@ def fit_maps(
     count = len(pixels.order)
     if count == 0:
         return
-    names = ("light", "exposure", "material", *(("detail", "bend") if stage.detail else ()))
+    names = ("light", "exposure", "material", *(("detail", "bend") if detail else ()))
     groups, opens = [], []
     for which in names:
         for k, value in enumerate(unknowns.groups()[which]):
@@ -185,8 +184,8 @@ def fit_maps(
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     first, settled = 0, False
     free, kept = weights.free_bend * len(data.used), weights.bend / len(data.used) ** 2
-    for step, progress in budget.part(stage.name, stage.until):
-        if stage.detail and progress >= MATERIAL_UNTIL and not settled:
+    for step, progress in budget.part(name, until):
+        if detail and progress >= MATERIAL_UNTIL and not settled:
             settled = True
             for value in (*unknowns.material, unknowns.detail):
                 value.requires_grad_(False)
@@ -194,18 +193,16 @@ def fit_maps(
         fade = fading(progress, settled)
         for group, opening in zip(optimizer.param_groups, opens, strict=True):
             group["lr"] = group["full"] * fade if progress >= opening else 0.0
-        rows = pixels.order[
-            torch.arange(first, first + min(PIXELS_PER_STEP, count), device=pixels.order.device, dtype=torch.int64)
-            % count
-        ]
+        end = first + min(PIXELS_PER_STEP, count)
+        rows = pixels.order[torch.arange(first, end, device=pixels.order.device, dtype=torch.int64) % count]
         first = (first + PIXELS_PER_STEP) % count
         samples = SHADING_SAMPLES[0] if progress < 0.5 else SHADING_SAMPLES[1]
-        estimate = Estimate(scene, samples, seed * 1_000_003 + step)
-        loss = maps_loss(unknowns, data, pixels, rows, replace(weights, bend=kept if settled else free), estimate)
+        own = replace(weights, bend=kept if settled else free)
+        loss = maps_loss(unknowns, data, pixels, rows, own, scene=scene, samples=samples, seed=seed * 1_000_003 + step)
         optimizer.zero_grad()  # to None: Adam skips frozen tensors
         loss.backward()
         optimizer.step()
-        budget.record(stage.name, step, float(loss.detach()))
+        budget.record(name, step, float(loss.detach()))
     for group in optimizer.param_groups:
         group["params"][0].requires_grad_(False)
     if not settled:  # interrupted

@@ -17,7 +17,7 @@ from reli3d.fit.choice import UNCHANGED, Fitted, Parts, chosen, mean_psnr, view_
 from reli3d.fit.input_images import InputImages, PosedImages
 from reli3d.fit.light_frame import light_follows_camera
 from reli3d.fit.light_hue import CHROMATICITY_WEIGHT, with_neutral_light
-from reli3d.fit.maps import FixedSurface, MapsStage, fit_maps
+from reli3d.fit.maps import FixedSurface, fit_maps
 from reli3d.fit.shape import ShapeData, empty, finished, fit_shape, start_grid
 from reli3d.fit.transfer import transfer_textures
 from reli3d.fit.unknowns import START_GRID, Start, Unknowns, corrected, filled_grid
@@ -25,9 +25,7 @@ from reli3d.geometry.mesh import watertight
 from reli3d.render.asset import Asset
 
 RESOLUTION = 128  # cells along the longest side
-LIGHT = MapsStage("light", until=0.12, detail=False)  # first the lighting, then the surface, then all maps
-SHAPE_UNTIL = 0.5  # fraction of the budget
-MAPS = MapsStage("maps", until=1.0)
+LIGHT_UNTIL, SHAPE_UNTIL = 0.12, 0.5  # fractions of the budget: first the lighting, then the surface, then all maps
 MIN_ATLAS_TEXELS = 256  # along a side of the new surface's textures: smaller ones have no room for its charts
 MAX_DETAIL_TEXELS = 512  # along a side of the base color's detail map
 UV_TOLERANCE = 1e-3  # beyond [0, 1]; within a texel
@@ -171,7 +169,7 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
     if closed:
         grid, sdf, bound = start_grid(first.mesh, images, options.resolution)
     unknowns = Unknowns.zero(sdf, len(images), min(MAX_DETAIL_TEXELS, texels), max(images.light_group) + 1)
-    fit_maps(unknowns, data, weights, budget, LIGHT, seed=seed)
+    fit_maps(unknowns, data, weights, budget, "light", LIGHT_UNTIL, seed=seed, detail=False)
     if closed:
         around = filled_grid(first.mesh.vertices, data.received, START_GRID)
         shape = ShapeData.of(start, sdf, bound, grid, around, images, used)
@@ -188,7 +186,7 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
             data = FixedSurface(start, surface, received, images, used)
     else:
         notes.append("refinement: the surface is not closed, so only maps and lighting are fitted")
-    fit_maps(unknowns, data, weights, budget, MAPS, seed=seed)
+    fit_maps(unknowns, data, weights, budget, "maps", 1.0, seed=seed)
     return Fitted(first, data.asset, data.received, start, unknowns, images)
 
 

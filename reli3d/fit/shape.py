@@ -21,7 +21,7 @@ from reli3d.fit.shading import radiance
 from reli3d.fit.unknowns import Start, Unknowns, corrected, material_change, material_of, unit
 from reli3d.fit.view_colors import MIN_COVERAGE, display_planes, view_colors, view_weights
 from reli3d.geometry.distance import signed_distance
-from reli3d.geometry.grid import sample_grid
+from reli3d.geometry.grid import sample_grid, squared_laplacian
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
 from reli3d.geometry.rays import RayScene
@@ -101,12 +101,12 @@ def hull_sdf(images: InputImages, grid: Grid) -> Tensor:
 
 @torch.no_grad()
 def curvature_weight(sdf: Tensor, bound: Tensor, cell: float) -> Tensor:
-    """Weights ``(X, Y, Z)`` of :func:`losses.curvature` at the points of the grid.
+    """Weights ``(X, Y, Z)`` of the squared Laplacian at the points of the grid.
 
     1 near parts at least ``2 CORE_DEPTH_CELLS`` thick, ``THIN_WEIGHT`` near thinner parts, 0 beyond ``BAND_CELLS`` from
-    the surface.  The medial axis of a thin part, where the curvature of the signed distance is large, lies inside the
-    band, so with full weight the term would remove the part.  Points deeper than ``CORE_DEPTH_CELLS`` form the core of
-    thick parts; band points that no core reaches count as thin.
+    the surface.  The medial axis of a thin part lies inside the band, so with full weight the term would remove the
+    part.  Points deeper than ``CORE_DEPTH_CELLS`` form the core of thick parts; band points that no core reaches count
+    as thin.
     """
     core = (torch.maximum(sdf, bound) < -CORE_DEPTH_CELLS * cell).to(sdf)[None, None]
     reach = round(CORE_DEPTH_CELLS + BAND_CELLS) + 1
@@ -177,11 +177,9 @@ class ShapeData:
         colored: list[int],
     ) -> ShapeData:
         """Resamples the images to the sizes of the fit and computes the weights of the grid's points."""
-        sizes = sorted(
-            {max(16, round(images.size * s)) for s in (IMAGE_SCALES[0], sum(IMAGE_SCALES) / 2, IMAGE_SCALES[1])}
-        )
+        sizes = {max(16, round(images.size * s)) for s in (*IMAGE_SCALES, sum(IMAGE_SCALES) / 2)}
         used = images.select(colored)
-        planes = [display_planes(used.resized(size)) for size in sizes]
+        planes = [display_planes(used.resized(size)) for size in sorted(sizes)]
         small = images.resized(min(OUTLINE_PIXELS, images.size))
         smooth = curvature_weight(sdf, bound, grid.cell)
         near = torch.nonzero(smooth.reshape(-1))[:, 0]
@@ -209,11 +207,10 @@ def shape_loss(
     scene = RayScene(mesh.vertices, mesh.faces)
     views, grid = len(data.images), data.grid
     moved = (unknowns.sdf.reshape(-1).index_select(0, data.near) - data.first) / grid.cell
-    loss = weights.curvature * losses.curvature(unknowns.sdf, grid.cell, data.smooth)
+    loss = weights.curvature * (squared_laplacian(unknowns.sdf, data.smooth) / (grid.cell * grid.cell))
     loss = loss + weights.sdf_change / views * moved.square().mean()
     loss = loss + weights.outline * _outlines(unknowns, data, mesh, scene, rng)
-    loss = loss + _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent)
-    return loss
+    return loss + _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent)
 
 
 def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, rng) -> Tensor:
@@ -232,10 +229,8 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     planes = data.planes[min(int(progress * len(data.planes)), len(data.planes) - 1)]
     size, images = planes.shape[-1], data.images.select(data.colored)
     camera = corrected(images.camera.resized(size, size), unknowns.pose[data.colored])
-    pick = torch.randint(len(mesh.vertices), (CONSISTENCY_POINTS,), generator=rng, dtype=torch.int64, device="cpu").to(
-        mesh.vertices.device
-    )
-    position, normal = (v.index_select(0, pick) for v in (mesh.vertices, mesh.normals))
+    pick = torch.randint(len(mesh.vertices), (CONSISTENCY_POINTS,), generator=rng, dtype=torch.int64, device="cpu")
+    position, normal = (v.index_select(0, pick.to(v.device)) for v in (mesh.vertices, mesh.normals))
     color, cover = view_colors(planes, position, camera)
     weight = view_weights(scene, position, normal, camera) * (cover.detach() > MIN_COVERAGE)
     exposure = unknowns.exposure[data.colored].exp()
@@ -267,9 +262,8 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
             other = lit(2 * seed + 1)
     loss = loss + weights.shading * losses.display_error(image, other, target, target > SATURATED_LINEAR)
     # the same ratio of the terms as in the fit of the maps
-    loss = loss + weights.shading * weights.palette * losses.palette(
-        points.base_color.clamp(min=losses.MIN_LINEAR).log(), target
-    )
+    logs = points.base_color.clamp(min=losses.MIN_LINEAR).log()
+    loss = loss + weights.shading * weights.palette * losses.palette(logs, target)
     loss = loss + weights.shading * losses.near_base_color(change[:, :3], weights, len(data.colored))
     return loss + weights.shading * losses.priors(unknowns, weights, len(data.images))
 

@@ -71,8 +71,6 @@ def transfer_textures(mesh: Mesh, source: Asset, size: int, *, shape: bool = Fal
 
 def _means(values: Tensor, factor: int) -> Tensor:
     """Means over squares of ``factor`` texels of a map ``(T, T, C)``."""
-    if factor == 1:
-        return values
     return torch.nn.functional.avg_pool2d(values.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0).contiguous()
 
 
@@ -86,9 +84,8 @@ def changed(asset: Asset, unknowns: Unknowns) -> Asset:
         index = next(parts)
         row, column = torch.div(index, size, rounding_mode="floor"), index % size
         uv = (torch.stack([column, row], -1).float() + 0.5) / size
-        old = surface_points(
-            asset.mesh, asset.textures, texels.face.reshape(-1)[index], texels.bary.reshape(-1, 2)[index]
-        )
+        face, bary = texels.face.reshape(-1)[index], texels.bary.reshape(-1, 2)[index]
+        old = surface_points(asset.mesh, asset.textures, face, bary)
         logits = material_logits(old) + material_change(unknowns, position)
         logits[:, :3] += sample_texture(unknowns.detail, uv)
         color, roughness, metallic = material_of(logits)

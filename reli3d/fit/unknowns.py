@@ -7,11 +7,11 @@ metallic; logarithms of radiance): zero is the start, and every value is valid.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate, normalize, pad
+from torch.nn.functional import avg_pool3d, interpolate, normalize, pad
 
 from reli3d.fit.fields import space_field
 from reli3d.geometry.bake import rasterize_texels
@@ -55,15 +55,15 @@ class Unknowns:
     @classmethod
     def zero(cls, sdf: Tensor, views: int, texels: int, lights: int = 1) -> Unknowns:
         """No change; ``sdf`` as given.  lights: number of lightings."""
-        device = sdf.device
+        zeros = partial(torch.zeros, device=sdf.device, dtype=torch.float32)
         return cls(
             sdf.clone(),
-            [torch.zeros(n, n, n, 5, device=device, dtype=torch.float32) for n in MATERIAL_GRIDS],
-            torch.zeros(texels, texels, 3, device=device, dtype=torch.float32),
-            [torch.zeros(n, n, n, 3, device=device, dtype=torch.float32) for n in BEND_GRIDS],
-            [torch.zeros(lights, n, 2 * n, 3, device=device, dtype=torch.float32) for n in LIGHT_MAPS],
-            torch.zeros(views, device=device, dtype=torch.float32),
-            torch.zeros(views, 6, device=device, dtype=torch.float32),
+            [zeros(n, n, n, 5) for n in MATERIAL_GRIDS],
+            zeros(texels, texels, 3),
+            [zeros(n, n, n, 3) for n in BEND_GRIDS],
+            [zeros(lights, n, 2 * n, 3) for n in LIGHT_MAPS],
+            zeros(views),
+            zeros(views, 6),
         )
 
     def groups(self) -> dict[str, list[Tensor]]:
@@ -90,10 +90,7 @@ class Start:
         c2w: ``(V, 4, 4)``, cameras in whose axes the lighting is represented, as the mean over them.
         """
         found = rasterize_texels(asset.mesh, texels)
-        valid = found.face.reshape(-1) >= 0
-        points = surface_points(
-            asset.mesh, asset.textures, found.face.reshape(-1)[valid], found.bary.reshape(-1, 2)[valid]
-        )
+        points = surface_points(asset.mesh, asset.textures, found.face[found.valid], found.bary[found.valid])
         material = filled_grid(points.position, material_logits(points), START_GRID)
         radiance = asset.light.resized(LIGHT_ROWS).radiance
         if c2w is not None:
@@ -179,8 +176,8 @@ def _pushed(total: Tensor) -> Tensor:
     mean = total[:, :-1] / total[:, -1:].clamp(min=1e-9)
     if total.shape[-1] == 1:
         return mean
-    coarse = torch.nn.functional.avg_pool3d(total, 2)
-    around = torch.nn.functional.interpolate(_pushed(coarse), total.shape[2:], mode="trilinear", align_corners=False)
+    coarse = avg_pool3d(total, 2)
+    around = interpolate(_pushed(coarse), total.shape[2:], mode="trilinear", align_corners=False)
     return torch.where(total[:, -1:] > 0.0, mean, around)
 
 

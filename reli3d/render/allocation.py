@@ -1,6 +1,7 @@
 """Allocates samples to the strategies of direct lighting by variances estimated in a pilot run."""
 
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import (
     DEFAULT,
+    Samples,
     ShadeOptions,
     sampling_plan,
     shade,
@@ -77,17 +79,16 @@ def plan_samples(
         weights = weights / (radiance.square() + (MIN_RELATIVE_RADIANCE * (weights @ radiance)) ** 2).clamp(min=1e-30)
     counts = _splits(int(total)).to(weights.device)
     variance = _variances(*drawn, weights, counts)
-    finer = counts[variance.argmin()] + _MOVES.to(counts) * max(1, int(total) // 16)
+    moves = counts.new_tensor(list(permutations((1, -1, 0))))
+    finer = counts[variance.argmin()] + moves * max(1, int(total) // 16)
     finer = finer[(finer >= 0.0).all(1)]
     counts, variance = torch.cat([counts, finer]), torch.cat([variance, _variances(*drawn, weights, finer)])
     alone = (counts > 0.0).sum(1) == 1
     best, single = int(variance.argmin()), int(torch.where(alone, variance, torch.inf).argmin())
     if best != single and float(variance[single]) < MAX_SINGLE_RATIO * float(variance[best]):
-        mixture, one = (
-            _measured_variance(values, weights, environment, counts[k], scene, options) for k in (best, single)
-        )
-        best = best if mixture < MIXTURE_RATIO * one else single
-    return SamplePlan(_whole(counts[best]), float(variance[best]))
+        measured = [_measured_variance(values, weights, environment, counts[k], scene, options) for k in (best, single)]
+        best = best if measured[0] < MIXTURE_RATIO * measured[1] else single
+    return SamplePlan(Samples(*counts[best].int().tolist()), float(variance[best]))
 
 
 def spread_rows(n: int, count: int, seed: int) -> Tensor:
@@ -96,7 +97,7 @@ def spread_rows(n: int, count: int, seed: int) -> Tensor:
 
 
 def _spread(count: int, seed: int) -> Tensor:
-    """Stratified numbers: one in each of ``count`` equal parts of [0, 1), float64."""
+    """One random number in each of ``count`` equal parts of [0, 1), float64."""
     jitter = torch.rand(count, dtype=torch.float64, generator=torch.Generator().manual_seed(int(seed)), device="cpu")
     return (torch.arange(count, dtype=torch.float32, device="cpu") + jitter) / count
 
@@ -121,15 +122,12 @@ def _draw(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``each`` samples of every strategy at P points, S per point, float64.
 
-    Returns values over q ``(P, S, 3)``, densities over q ``(P, S, 3)``, and the densities normalized so that the
-    samples of a strategy, with its own samples below the horizon, have weight 1; then a constant integrand has
-    variance 0.
+    Returns values and densities over q, both ``(P, S, 3)``, and the densities normalized so that a strategy's samples,
+    with its own below the horizon, have weight 1; then a constant integrand has variance 0.
     """
     n, count, device = len(values[0]), 3 * each, values[0].device
-    options = replace(
-        DEFAULT, samples=(each,) * 3, seed=options.seed, antithetic="none", diffuse_model=options.diffuse_model
-    )
-    plan, offsets = sampling_plan(options, scene)
+    own = dict(samples=(each,) * 3, seed=options.seed, antithetic="none", diffuse_model=options.diffuse_model)
+    plan, offsets = sampling_plan(replace(DEFAULT, **own), scene)
     light = struct_of_light(environment.radiance.contiguous(), environment.cdf, offsets.to(device))
     pixels = torch.arange(n, dtype=torch.int32, device=device)
     ins = [struct_of_points([v.contiguous() for v in values], pixels), light, plan]
@@ -152,16 +150,10 @@ def _measured_variance(
     """Measured variance of :func:`reli3d.render.shading.shade` with ``counts``, weighted mean over the points."""
     runs = TRIAL_POINTS // len(weights)
     position, normal, ng, wo, *material = (v.repeat(runs, *[1] * (v.ndim - 1)) for v in values)
-    options = replace(
-        options, samples=_whole(counts), antithetic="none", alpha="linear", heuristic="balance", clamp=None
-    )
+    given = dict(samples=counts.tolist(), antithetic="none", alpha="linear", heuristic="balance", clamp=None)
+    options = replace(options, **given)
     drawn = shade(SurfacePoints(position, ng, normal, *material), wo, environment, scene=scene, options=options)
     return float(weights @ drawn.double().unflatten(0, (runs, -1)).var(0).sum(1))
-
-
-def _whole(counts: Tensor) -> tuple[int, int, int]:
-    light, normals, cosine = (int(k) for k in counts)
-    return light, normals, cosine
 
 
 def _splits(total: int) -> Tensor:
@@ -169,11 +161,6 @@ def _splits(total: int) -> Tensor:
     steps = min(total, 8)
     edges = [(total * a // steps, total * b // steps) for a in range(steps + 1) for b in range(a, steps + 1)]
     return torch.tensor([(a, b - a, total - b) for a, b in edges], dtype=torch.float64, device="cpu")
-
-
-_MOVES = torch.tensor(
-    [[1, -1, 0], [-1, 1, 0], [1, 0, -1], [-1, 0, 1], [0, 1, -1], [0, -1, 1]], dtype=torch.int64, device="cpu"
-)
 
 
 def _variances(value: Tensor, density: Tensor, weight: Tensor, weights: Tensor, counts: Tensor) -> Tensor:

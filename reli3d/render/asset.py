@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torch import Tensor
 
 from reli3d._bridge import Movable, check, expect, present, tensor_of
@@ -12,7 +11,6 @@ from reli3d.render.environment import Environment
 
 FLAT = (0.5, 0.5, 1.0)  # texel of a normal map without perturbation
 WRAPS = ("repeat", "mirror", "clamp")  # glTF's REPEAT, MIRRORED_REPEAT, CLAMP_TO_EDGE
-KEPT = 2048  # texels a side up to which lookups are kept: 50 MB
 
 
 @dataclass(frozen=True, repr=False)
@@ -50,50 +48,26 @@ class TextureSet(Movable):
     def __post_init__(self):
         if len(self.wrap) != 2 or not set(self.wrap) <= set(WRAPS):
             raise ValueError(f"wrap: expected two of {', '.join(WRAPS)}, got {self.wrap}")
-        self._set("base_color", self.base_color, 3)
-        for name in ("roughness", "metallic"):
-            value = getattr(self, name)
-            if isinstance(value, (int, float)):
-                value = self.base_color.new_full(self.base_color.shape[:2], float(value))
-            self._set(name, value, 1)
-        flat = self.normal if self.normal is not None else self.base_color.new_tensor(FLAT).repeat(*[self.size] * 2, 1)
-        self._set("normal", flat, 3)
-
-    def _set(self, name: str, value: Tensor, channels: int) -> None:
-        value = tensor_of(value)
-        check(name, value)
-        if channels == 1 and value.ndim == 3 and value.shape[2] == 1:
-            value = value[..., 0]
-        first = value if name == "base_color" else self.base_color
-        check(name, value, like=first)
-        size = (first.shape[0] if first.ndim else 0,) * 2
-        if value.shape != (size if channels == 1 else (*size, channels)) or size[0] == 0:
-            expected = "(T, T, 3)" if name == "base_color" else f"{size if channels == 1 else (*size, channels)}"
-            raise ValueError(f"{name}: expected shape {expected}, got {tuple(value.shape)}")
-        object.__setattr__(self, name, value)
+        base = tensor_of(self.base_color)
+        size = base.shape[0] if isinstance(base, Tensor) and base.ndim else 0
+        for name, channels in (("base_color", (3,)), ("roughness", ()), ("metallic", ()), ("normal", (3,))):
+            value = tensor_of(getattr(self, name))
+            if isinstance(value, (int, float)) and not channels:
+                value = base.new_full((size, size), float(value))
+            elif value is None and name == "normal":
+                value = base.new_tensor(FLAT).repeat(size, size, 1)
+            check(name, value, like=base)
+            if not channels and value.ndim == 3 and value.shape[2] == 1:
+                value = value[..., 0]
+            if value.shape != (size, size, *channels) or size == 0:
+                expected = "(T, T, 3)" if name == "base_color" else f"{(size, size, *channels)}"
+                raise ValueError(f"{name}: expected shape {expected}, got {tuple(value.shape)}")
+            object.__setattr__(self, name, value)
 
     @property
     def size(self) -> int:
         """Texels per side."""
         return self.base_color.shape[0]
-
-    def rough_metal(self) -> Tensor:
-        """Map ``(T, T, 3)`` with the channels roughness, metallic, metallic: one three-channel lookup reads both maps.
-
-        Cached for gradient-free maps of at most ``KEPT`` texels per side until they are modified.
-        """
-        sources = self.roughness, self.metallic
-        changing = torch.is_inference_mode_enabled() or any(
-            s.is_inference() or (s.requires_grad and torch.is_grad_enabled()) for s in sources
-        )
-        lasting = self.size <= KEPT and not changing
-        written = tuple(s._version for s in sources) if lasting else None
-        kept, values = vars(self).get("_rough_metal", (None, None))
-        if not lasting or kept != written:
-            values = torch.stack([self.roughness, self.metallic, self.metallic], -1)
-        if lasting:
-            object.__setattr__(self, "_rough_metal", (written, values))
-        return values
 
     def __repr__(self) -> str:
         return f"TextureSet({self.size} x {self.size} texels, {self.base_color.device})"
@@ -116,8 +90,9 @@ class Asset(Movable):
     environment: Environment | None = None
 
     def __post_init__(self):
-        for name, kind in (("mesh", Mesh), ("textures", TextureSet), ("environment", Environment)):
-            if name == "mesh" or getattr(self, name) is not None:
+        expect("mesh", self.mesh, Mesh)
+        for name, kind in (("textures", TextureSet), ("environment", Environment)):
+            if getattr(self, name) is not None:
                 expect(name, getattr(self, name), kind)
 
     @property

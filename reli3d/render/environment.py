@@ -87,8 +87,7 @@ class Environment(Movable):
     def irradiance(self) -> "Environment":
         """Irradiance [radiance times sr] for every surface normal, as a lat-long map of the same size.
 
-        Sums all n texels, weighted by cosine and solid angle, for each normal: n^2 terms, so use maps of at most 32
-        rows.  Uniform radiance L gives pi L.  Gradients reach the texels.
+        A sum of n^2 terms for n texels, so use maps of at most 32 rows.  Gradients reach the texels.
         """
         height, width = self.radiance.shape[:2]
         directions = lat_long_directions(height, width, dtype=torch.float64).reshape(-1, 3)
@@ -126,8 +125,8 @@ class Environment(Movable):
     def cdf(self) -> EnvironmentCDF:
         """Importance-sampling CDF; the weight of a texel is the integral of the bilinear luminance over it.
 
-        This integral equals the luminance filtered by (1/8, 3/4, 1/8) along each axis, so the density is 0 only where
-        the lookup is 0.  A black map is sampled uniformly over the sphere.  Raises ValueError for a non-finite texel.
+        This integral equals the luminance filtered by (1/8, 3/4, 1/8) along each axis.  A black map is sampled
+        uniformly over the sphere.  Raises ValueError for a non-finite texel.
         """
         radiance = self.radiance.detach().double()
         if not bool(torch.isfinite(radiance).all()):
@@ -154,11 +153,9 @@ class Environment(Movable):
     def sample(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Directions ``(..., 3)`` and density ``(...)`` [1/sr] for uniform ``u (..., 2)`` in [0, 1).  No gradient."""
         check("u", u, last=2, like=self.radiance)
-        flat, cdf = u.detach().reshape(-1, 2).contiguous(), self.cdf
-        n = flat.shape[0]
-        directions, pdf = empty((n,), wp.vec3, flat.device), empty((n,), wp.float32, flat.device)
-        args = [cdf.rows, cdf.columns, cdf.row_guide, cdf.column_guide, cdf.density, flat, directions, pdf]
-        launch(kernels.sample_envmap_kernel, n, args, flat.device)
+        flat = u.detach().reshape(-1, 2).contiguous()
+        directions, pdf = (empty((len(flat),), kind, flat.device) for kind in (wp.vec3, wp.float32))
+        launch(kernels.sample_envmap_kernel, len(flat), [*vars(self.cdf).values(), flat, directions, pdf], flat.device)
         return directions.reshape(*u.shape[:-1], 3), pdf.reshape(u.shape[:-1])
 
     def pdf(self, directions: Tensor) -> Tensor:

@@ -56,8 +56,7 @@ def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camer
 
     images: ``(V, H, W, 3)`` sRGB, at least ``STEP`` pixels per side.  inside: ``(V, H, W)`` bool, pixels inside the
     silhouette.  camera: a batch of V.  scene: rays against the asset's mesh.  The means are over a regular grid of
-    pixels at which the asset is hit and the image is not overexposed.  No gradient.  Raises ValueError for smaller
-    images.
+    pixels at which the asset is hit and the image is not overexposed.  No gradient.
     """
     seen, at, directions = _seen(asset, images, inside, camera, scene)
     shown = shade(at, -directions, asset.light, scene=scene, options=ShadeOptions(samples=SAMPLES))
@@ -71,8 +70,7 @@ def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camer
 def base_color_factor(asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene) -> Tensor:
     """Maximum a posteriori factor ``(3,)`` on the linear base color of ``asset``; 1 if no pixel is visible.
 
-    The log brightness combines three normal distributions: the albedo prior, the observed colors under the lighting
-    prior, and the base color of ``asset``.  The chromaticity is a weighted mean of the observed one and the asset's.
+    The brightness is that of the module's text, the chromaticity a weighted mean of the observed one and the asset's.
     Arguments as in :func:`photograph_ratio`; the environment of ``asset`` is not used.
     """
     seen, at, _ = _seen(asset, images, inside, camera, scene)
@@ -82,12 +80,9 @@ def base_color_factor(asset: Asset, images: Tensor, inside: Tensor, camera: Came
     weights = [1.0 / spread**2 for spread in (ALBEDO_SPREAD, LIGHT_SPREAD, PREDICTION_SPREAD)]
     estimates = torch.stack([seen.new_tensor(ALBEDO), photograph.mean().log() - LIGHT, prediction.mean().log()])
     brightness = (seen.new_tensor(weights) * estimates).sum() / sum(weights)
-    color = (PHOTOGRAPH_COLOR * _color(photograph) + PREDICTED_COLOR * _color(prediction)).exp()
+    logs = [color.log() - color.log().mean() for color in (photograph, prediction)]
+    color = (PHOTOGRAPH_COLOR * logs[0] + PREDICTED_COLOR * logs[1]).exp()
     return (brightness.exp() * color / color.mean() / prediction).clamp(1.0 / FARTHEST, FARTHEST)
-
-
-def _color(value: Tensor) -> Tensor:
-    return value.log() - value.log().mean()
 
 
 def _seen(

@@ -26,13 +26,9 @@ class SphericalGaussians:
     amplitude: Tensor
 
     def __post_init__(self):
-        check("axis", self.axis, last=3)
-        check("sharpness", self.sharpness, like=self.axis)
-        check("amplitude", self.amplitude, last=3, like=self.axis)
-        count = len(self.axis) if self.axis.ndim else 0
-        shapes = tuple(self.axis.shape), tuple(self.sharpness.shape), tuple(self.amplitude.shape)
-        if shapes != ((count, 3), (count,), (count, 3)):
-            raise ValueError(f"axis, sharpness, amplitude: expected (K, 3), (K,), (K, 3), got {shapes}")
+        check("axis", self.axis, shape=("K", 3))
+        check("sharpness", self.sharpness, shape=(len(self.axis),), like=self.axis)
+        check("amplitude", self.amplitude, shape=(len(self.axis), 3), like=self.axis)
 
 
 def shade_gaussians(points: SurfacePoints, wo: Tensor, light: SphericalGaussians) -> Tensor:

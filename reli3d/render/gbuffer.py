@@ -102,7 +102,8 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
     if mesh.uv is None:
         raise ValueError("mesh.uv: expected texture coordinates for a textured asset, got None (see unwrap)")
     uv = wrap_uv(interpolate(mesh.uv, mesh.faces, face, bary), textures.wrap, (textures.size, textures.size))
-    rough_metal = sample_texture(textures.rough_metal(), uv)  # one lookup for both
+    maps = torch.stack([textures.roughness, textures.metallic, textures.metallic], -1)
+    rough_metal = sample_texture(maps, uv)  # one three-channel lookup reads both
     mapped = sample_texture(textures.normal, uv) * 2.0 - 1.0
     color = sample_texture(textures.base_color, uv)
     if mesh.colors is not None:

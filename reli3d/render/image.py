@@ -151,15 +151,8 @@ def render_lights(
     roughness, metallic = (orm / cover).unbind(-1)
     inside = alpha[..., 0] > 0.0
     depth = torch.where(inside, (depth / cover)[..., 0], torch.inf)
-    shared = (
-        alpha[..., 0],
-        base_color / cover,
-        roughness,
-        metallic,
-        normalize(normal, dim=-1),
-        position / cover,
-        depth,
-    )
+    normal, position = normalize(normal, dim=-1), position / cover
+    shared = alpha[..., 0], base_color / cover, roughness, metallic, normal, position, depth
     return [Render(radiance, *shared) for radiance in radiances]
 
 
@@ -193,15 +186,8 @@ def plan_render(
     if not bool(seen.any()):
         raise ValueError(f"camera: expected the asset in view, got {len(rays)} rays without a hit")
     points = _points(parts, hits.face[seen], hits.bary[seen])
-    return plan_samples(
-        points,
-        -directions[seen],
-        light,
-        total=total,
-        scene=scene if shadows else None,
-        options=options,
-        relative=relative,
-    )
+    shadowed, wo = scene if shadows else None, -directions[seen]
+    return plan_samples(points, wo, light, total=total, scene=shadowed, options=options, relative=relative)
 
 
 def _checked(
@@ -259,15 +245,8 @@ def _band(parts, camera, lights, scene, first, shadows, background, options) -> 
     lit = [shade(points, wo, light, scene=shadowed, options=options, pixels=pixels) for light in lights]
     axis = -camera.c2w[:3, 2]
     depth = ((points.position - camera.position) * axis).sum(-1, keepdim=True)
-    layers = [
-        *lit,
-        torch.ones_like(depth),
-        points.base_color,
-        torch.stack([points.roughness, points.metallic], -1),
-        points.normal,
-        points.position,
-        depth,
-    ]
+    rough_metal = torch.stack([points.roughness, points.metallic], -1)
+    layers = [*lit, torch.ones_like(depth), points.base_color, rough_metal, points.normal, points.position, depth]
     for k, layer in enumerate(layers):
         image = layer.new_zeros(camera.height * camera.width, layer.shape[1]).index_copy(0, index, layer)
         if background == "environment" and k < len(lights):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from reli3d._bridge import call, empty, launch
 from reli3d.kernels import bsdf as kernels
-from reli3d.render.sampling import flattened, mirror, reflect, sample_cosine, sample_ggx_vndf
+from reli3d.render.sampling import flattened, reflect, sample_cosine, sample_ggx_vndf
 
 DIFFUSE_MODELS = ("conserving", "published")  # energy transmitted to the diffuse layer: reli3d.kernels.bsdf
 LOBES = ("visible", "mirrored", "cosine")  # in the order of the kernel's columns
@@ -72,7 +72,7 @@ def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") 
     wm = sample_ggx_vndf(wo, alpha, u)
     if lobe == "visible":
         return reflect(wo, wm)
-    wm = mirror(wm)
+    wm = wm * wm.new_tensor([-1.0, -1.0, 1.0])  # turned by pi about the surface normal
     wi = reflect(wo, wm)
     away = (wo * wm).sum(-1, keepdim=True) <= 0.0
     return torch.where(away, torch.stack([wi[..., 0], wi[..., 1], -wi[..., 2].abs()], -1), wi)

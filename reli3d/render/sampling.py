@@ -109,12 +109,6 @@ def tangent_frame(normal: Tensor) -> Tensor:
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
-def mirror(wm: Tensor) -> Tensor:
-    """Microfacet normals ``(..., 3)`` rotated by pi about the surface normal."""
-    check("wm", wm, last=3)
-    return wm * wm.new_tensor([-1.0, -1.0, 1.0])
-
-
 def reflect(wo: Tensor, wm: Tensor) -> Tensor:
     """Mirror reflection ``(..., 3)`` of ``wo`` about the microfacet normal ``wm``: ``2 (wo.wm) wm - wo``.
 

@@ -250,12 +250,9 @@ def shaded_arrays(
     points: SurfacePoints, wo: Tensor, environment: Environment, scene: RayScene | None, options: ShadeOptions
 ) -> tuple[Tensor, ...]:
     """The seven point arrays in kernel argument order, checked, with GGX width instead of roughness."""
-    for name, value, kind in (
-        ("points", points, SurfacePoints),
-        ("environment", environment, Environment),
-        ("options", options, ShadeOptions),
-    ):
-        expect(name, value, kind)
+    expect("points", points, SurfacePoints)
+    expect("environment", environment, Environment)
+    expect("options", options, ShadeOptions)
     position = points.position
     check("environment.radiance", environment.radiance, like=position)
     if scene is not None and scene.device != position.device:

@@ -1,16 +1,13 @@
 """Silhouette antialiasing, differentiable in the vertices, for images sampled at pixel centers.
 
 After Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.4: two neighboring
-pixels are blended where a silhouette crosses the line between their centers.  Laine et al. search for the silhouette
-edge among the edges of the triangle at a pixel center, which misses edges of triangles smaller than a pixel.  Here all
-crossings of edges with rows and columns of pixel centers are listed, and each is tested for visibility with a ray.
+pixels are blended where a silhouette crosses the line between their centers.  Unlike there, all crossings of edges with
+rows and columns of pixel centers are listed, and each is tested for visibility with a ray, so that edges of triangles
+smaller than a pixel are found.
 
-The sum over an antialiased mask has the exact derivative of the covered area.  Compared with exact area coverage in [0,
-1], pixels crossed by a silhouette have a mean absolute error of 0.01 to 0.03; gradients of a sum of squared differences
-have a relative error of about 10 %.
+The sum over an antialiased mask has the exact derivative of the covered area.  Pixels crossed by a silhouette have a
+mean absolute error of 0.01 to 0.03 of coverage; gradients of a sum of squared differences err by about 10 %.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -25,20 +22,6 @@ from reli3d.geometry.topology import edges_of
 DEPTH_MIN = 1e-6  # nearer ends count as behind the eye; their pixel would be beyond any image
 RAY_OFFSET_PIXELS = 0.01  # pixels from the edge to the visibility ray, so that it does not graze the edge's own faces
 IN_FRONT = 1e-3  # fraction of the distance by which an occluder must be nearer; above float32 rounding at folds
-
-
-@dataclass(frozen=True)
-class Crossings:
-    """Crossings of visible silhouettes with the lines between neighboring pixel centers; M pairs of neighbors.
-
-    Each pair is listed at most once per direction.  inner, outer: ``(M,)`` int64 pixel index (row * W + column) on the
-    surface side and on the other side.  place: ``(M,)`` in [0, 1], distance from the inner center to the crossing in
-    pixels.  Gradients reach the vertices and the camera.
-    """
-
-    inner: Tensor
-    outer: Tensor
-    place: Tensor
 
 
 def mesh_edges(vertices: Tensor, faces: Tensor) -> Tensor:
@@ -64,64 +47,6 @@ def mesh_edges(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 @full_precision
-def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: RayScene) -> Crossings:
-    """Crossings of visible silhouettes with the lines between pixel centers.
-
-    vertices: ``(V, 3)``.  edges: from :func:`mesh_edges`.  camera: a single camera.  scene: the occluders, normally the
-    mesh and everything else in view.  Edges with an end behind the camera are omitted.  If several crossings of a pair
-    have the same direction, the outermost is kept.
-    """
-    check("vertices", vertices, last=3)
-    check("edges", edges, last=4, like=vertices, dtype=torch.int32)
-    if camera.c2w.ndim != 2:
-        raise ValueError(f"camera.c2w: expected one camera (4, 4), got {tuple(camera.c2w.shape)}")
-    if edges.ndim != 2 or (edges.numel() and not -1 <= int(edges.min()) <= int(edges.max()) < len(vertices)):
-        raise ValueError(f"edges: expected (E, 4) indices below {len(vertices)}, got others")
-    if scene.device != vertices.device:
-        raise ValueError(f"scene: expected device {vertices.device}, got {scene.device}")
-    edge, line, steep, outward = _lines(vertices, edges, camera)
-    ends = [vertices.index_select(0, k) for k in edges.long()[edge, :2].unbind(1)]
-    (a, za), (b, zb) = (project(p, camera.c2w, camera.intrinsics) for p in ends)
-    a, b = (torch.where(steep[:, None], p.flip(1), p) for p in (a, b))  # the coordinate that runs over lines first
-    center = line.to(vertices.dtype) + 0.5
-    part = (center - a[:, 0]) / (b[:, 0] - a[:, 0])
-    across = a[:, 1] + part * (b[:, 1] - a[:, 1])
-    low = torch.floor(across.detach() - 0.5)
-    size = torch.where(steep, camera.width, camera.height)
-    inner_at = torch.where(outward > 0.0, low, low + 1.0)
-    place = (across - inner_at - 0.5) * outward
-    keep = (low >= 0.0) & (low < size - 1)
-    depth = 1.0 / ((1.0 - part) / za + part / zb)
-    offset = torch.stack([center, across + RAY_OFFSET_PIXELS * outward], 1).detach()
-    keep &= _seen(torch.where(steep[:, None], offset.flip(1), offset), depth.detach(), camera, scene)
-    stride = torch.where(steep, 1, camera.width)
-    inner = torch.where(steep, line * camera.width + inner_at.long(), inner_at.long() * camera.width + line)
-    outer = inner + stride * outward.long()
-    chosen = _outermost(keep, inner * 4 + 2 * steep + (outward > 0.0), place.detach(), 4 * camera.width * camera.height)
-    return Crossings(inner[chosen], outer[chosen], place.index_select(0, chosen))
-
-
-def blend_outlines(image: Tensor, crossings: Crossings) -> Tensor:
-    """``image (H, W, C)`` with the pixels of each crossing blended according to the position of the silhouette.
-
-    Of each pair, the pixel that the silhouette crosses changes.  The blends of several pairs add up; weights are scaled
-    down where their sum exceeds 1, so values stay between those of the neighbors.  Gradients reach the image and the
-    crossings.
-    """
-    check("image", image, shape=("H", "W", "C"), like=crossings.place)
-    flat = image.reshape(-1, image.shape[2])
-    grows = crossings.place.detach() > 0.5  # the surface spills into the outer pixel
-    into = torch.where(grows, crossings.outer, crossings.inner)
-    other = torch.where(grows, crossings.inner, crossings.outer)
-    if into.numel() and int(torch.maximum(into, other).max()) >= len(flat):
-        raise ValueError(f"image: expected the size that the crossings were made for, got {tuple(image.shape)}")
-    weight = (crossings.place - 0.5).abs()
-    total = weight.new_zeros(len(flat)).index_add(0, into, weight).clamp(min=1.0)
-    contrast = flat.index_select(0, other) - flat.index_select(0, into)
-    return flat.index_add(0, into, (weight / total.index_select(0, into))[:, None] * contrast).reshape(image.shape)
-
-
-@full_precision
 def antialias(
     image: Tensor,
     vertices: Tensor,
@@ -144,12 +69,65 @@ def antialias(
     >>> mask = reli3d.RayScene(mesh).intersect(*reli3d.camera_rays(camera)).valid[..., None].float()
     >>> smooth = reli3d.antialias(mask, mesh.vertices, mesh.faces, camera)
     """
+    check("vertices", vertices, last=3)
     check("image", image, like=vertices)
+    if camera.c2w.ndim != 2:
+        raise ValueError(f"camera.c2w: expected one camera (4, 4), got {tuple(camera.c2w.shape)}")
     if image.ndim != 3 or image.shape[:2] != (camera.height, camera.width):
         raise ValueError(f"image: expected ({camera.height}, {camera.width}, C), got {tuple(image.shape)}")
     edges = mesh_edges(vertices, faces) if edges is None else edges
+    check("edges", edges, shape=("E", 4), like=vertices, dtype=torch.int32)
+    if edges.numel() and not -1 <= int(edges.min()) <= int(edges.max()) < len(vertices):
+        raise ValueError(f"edges: expected (E, 4) indices below {len(vertices)}, got others")
     scene = RayScene(vertices, faces) if scene is None else scene
-    return blend_outlines(image, outline_crossings(vertices, edges, camera, scene))
+    if scene.device != vertices.device:
+        raise ValueError(f"scene: expected device {vertices.device}, got {scene.device}")
+    return _blended(image, *_crossings(vertices, edges, camera, scene))
+
+
+def _crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: RayScene) -> tuple[Tensor, Tensor, Tensor]:
+    """Crossings of visible silhouettes with the lines between neighboring pixel centers; M pairs of neighbors.
+
+    Returns the pixel index (row * W + column) on the surface side and on the other side, ``(M,)`` int64, and the
+    distance ``(M,)`` in [0, 1] from the inner center to the crossing in pixels, whose gradients reach the vertices and
+    the camera.  Edges with an end behind the camera are omitted.  Of several crossings of a pair in the same direction,
+    the outermost is kept.
+    """
+    edge, line, steep, outward = _lines(vertices, edges, camera)
+    ends = [vertices.index_select(0, k) for k in edges.long()[edge, :2].unbind(1)]
+    (a, za), (b, zb) = (project(p, camera.c2w, camera.intrinsics) for p in ends)
+    a, b = (torch.where(steep[:, None], p.flip(1), p) for p in (a, b))  # the coordinate that runs over lines first
+    center = line.to(vertices.dtype) + 0.5
+    part = (center - a[:, 0]) / (b[:, 0] - a[:, 0])
+    across = a[:, 1] + part * (b[:, 1] - a[:, 1])
+    low = torch.floor(across.detach() - 0.5)
+    size = torch.where(steep, camera.width, camera.height)
+    inner_at = torch.where(outward > 0.0, low, low + 1.0)
+    place = (across - inner_at - 0.5) * outward
+    keep = (low >= 0.0) & (low < size - 1)
+    depth = 1.0 / ((1.0 - part) / za + part / zb)
+    offset = torch.stack([center, across + RAY_OFFSET_PIXELS * outward], 1).detach()
+    keep &= _seen(torch.where(steep[:, None], offset.flip(1), offset), depth.detach(), camera, scene)
+    stride = torch.where(steep, 1, camera.width)
+    inner = torch.where(steep, line * camera.width + inner_at.long(), inner_at.long() * camera.width + line)
+    outer = inner + stride * outward.long()
+    chosen = _outermost(keep, inner * 4 + 2 * steep + (outward > 0.0), place.detach(), 4 * camera.width * camera.height)
+    return inner[chosen], outer[chosen], place.index_select(0, chosen)
+
+
+def _blended(image: Tensor, inner: Tensor, outer: Tensor, place: Tensor) -> Tensor:
+    """``image (H, W, C)`` with the pixels of each crossing blended according to the position of the silhouette.
+
+    Of each pair, the pixel that the silhouette crosses changes.  The blends of several pairs add up; weights are scaled
+    down where their sum exceeds 1, so values stay between those of the neighbors.
+    """
+    flat = image.reshape(-1, image.shape[2])
+    grows = place.detach() > 0.5  # the surface spills into the outer pixel
+    into, other = torch.where(grows, outer, inner), torch.where(grows, inner, outer)
+    weight = (place - 0.5).abs()
+    total = weight.new_zeros(len(flat)).index_add(0, into, weight).clamp(min=1.0)
+    contrast = flat.index_select(0, other) - flat.index_select(0, into)
+    return flat.index_add(0, into, (weight / total.index_select(0, into))[:, None] * contrast).reshape(image.shape)
 
 
 def _lines(vertices: Tensor, edges: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -165,9 +143,8 @@ def _lines(vertices: Tensor, edges: Tensor, camera: Camera) -> tuple[Tensor, Ten
     r = torch.where(ends[:, 3] >= 0, (normal * (d - a)).sum(-1), s)
     (p, zp), (q, zq) = (project(end, camera.c2w, camera.intrinsics) for end in (a, b))
     steep = (q - p)[:, 1].abs() > (q - p)[:, 0].abs()
-    low, high = torch.aminmax(
-        torch.where(steep, torch.stack([p[:, 1], q[:, 1]]), torch.stack([p[:, 0], q[:, 0]])), dim=0
-    )
+    ends_along = torch.where(steep, torch.stack([p[:, 1], q[:, 1]]), torch.stack([p[:, 0], q[:, 0]]))
+    low, high = torch.aminmax(ends_along, dim=0)
     size = torch.where(steep, camera.height, camera.width).to(low)
     outline = (s * r >= 0.0) & ((s != 0.0) | (r != 0.0)) & (zp > DEPTH_MIN) & (zq > DEPTH_MIN)
     # lines with a center in [low, high)
@@ -177,9 +154,8 @@ def _lines(vertices: Tensor, edges: Tensor, camera: Camera) -> tuple[Tensor, Ten
     outward = torch.where((normal * towards).sum(-1) * (s + r) > 0.0, -1.0, 1.0).to(vertices)
     count = last - first
     edge = torch.repeat_interleave(count)
-    line = (
-        first[edge] + torch.arange(len(edge), device=edge.device, dtype=torch.int64) - (count.cumsum(0) - count)[edge]
-    )
+    before = (count.cumsum(0) - count)[edge]
+    line = first[edge] + torch.arange(len(edge), device=edge.device, dtype=torch.int64) - before
     return edge, line, steep[edge], outward[edge]
 
 

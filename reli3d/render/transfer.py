@@ -75,12 +75,14 @@ def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None
     first, label = weld_rows(torch.cat([mesh.vertices.detach(), normals], 1).cpu().numpy())  # seams have copies
     rows = torch.from_numpy(first).to(device)
     position, normal = mesh.vertices.detach()[rows], normals[rows]
-    start = position + RAY_OFFSET_EDGES * _mean_edge(mesh) * normal
+    corner = mesh.vertices.detach()[mesh.faces[:, :2].long()]
+    mean_edge = (corner[:, 1] - corner[:, 0]).norm(dim=-1).sum() / max(len(mesh.faces), 1)
+    start = position + RAY_OFFSET_EDGES * mean_edge * normal
     toward = sphere_spiral(directions).to(device)
     cosine = (normal @ toward.T).clamp(min=0.0)
     above = cosine > 0.0
     vertex, which = above.nonzero(as_tuple=True)  # rays of one vertex are consecutive
-    far = torch.full((len(vertex),), torch.inf, device=device, dtype=torch.float32)
+    far = start.new_full((len(vertex),), torch.inf)
     scene = scene if scene is not None else RayScene(mesh.vertices, mesh.faces)
     # index_select takes rows in a third of the time of an index
     free = scene.unoccluded(start.index_select(0, vertex), toward.index_select(0, which), far)
@@ -95,9 +97,3 @@ def sphere_spiral(count: int) -> Tensor:
     height, turn = 1.0 - 2.0 * k / count, k * (math.pi * (3.0 - math.sqrt(5.0)))
     across = (1.0 - height * height).sqrt()
     return torch.stack([across * turn.cos(), height, across * turn.sin()], -1).float()
-
-
-def _mean_edge(mesh: Mesh) -> Tensor:
-    """Mean length of a side of the faces; 0 without faces."""
-    corner = mesh.vertices.detach()[mesh.faces[:, :2].long()]
-    return (corner[:, 1] - corner[:, 0]).norm(dim=-1).sum() / max(len(mesh.faces), 1)

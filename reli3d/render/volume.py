@@ -48,11 +48,8 @@ class OccupancyGrid:
         half a cell may be missed between center and corners.
         """
         k = (torch.arange(2 * resolution + 1, device=device, dtype=torch.float32) / resolution - 1.0) * radius
-        values = []
         with torch.no_grad():
-            points = torch.cartesian_prod(k, k, k)
-            for part in points.split(CHUNK):
-                values.append(field(part) > threshold)
+            values = [field(part) > threshold for part in torch.cartesian_prod(k, k, k).split(CHUNK)]
         fine = torch.cat(values).reshape(1, 1, *(2 * resolution + 1,) * 3).float()
         cells = torch.nn.functional.max_pool3d(fine, 3, 2)
         return cls(torch.nn.functional.max_pool3d(cells, 3, 1, 1)[0, 0] > 0.0, radius)
@@ -114,16 +111,10 @@ def march_rays(
     if shift.shape not in ((1,), (n,)) or (shift.numel() and not 0.0 <= float(shift.min()) <= float(shift.max()) < 1.0):
         raise ValueError(f"shift: expected ({n},) numbers in [0, 1), got {tuple(shift.shape)} or others")
     device = origins.device
-    rays = [
-        grid.occupied.contiguous().view(torch.uint8),
-        origins.detach().contiguous(),
-        directions.detach().contiguous(),
-        shift.detach().contiguous(),
-    ]
+    rays = [v.detach().contiguous() for v in (grid.occupied.view(torch.uint8), origins, directions, shift)]
     numbers = [float(grid.radius), float(step), float(near), float(min(far, 3.0e38))]
     count = torch.zeros(n, dtype=torch.int32, device=device)
-    none = torch.empty(0, dtype=torch.int32, device=device), torch.empty(0, dtype=torch.float32, device=device)
-    launch(kernels.samples_kernel, n, [*rays, *numbers, 0, none[0], count, none[1]], device)
+    launch(kernels.samples_kernel, n, [*rays, *numbers, 0, count[:0], count, origins.new_empty(0)], device)
     total = torch.nn.functional.pad(count.long().cumsum(0), (1, 0))
     if int(total[-1]) >= 2**31:
         raise ValueError(f"step: expected fewer than 2**31 samples, got {int(total[-1])}")

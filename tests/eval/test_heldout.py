@@ -48,27 +48,24 @@ def test_two_ways_to_average():
 def test_an_empty_field_counts_as_nothing_found_and_spoils_no_mean(monkeypatch):
     """A network without surface, then one whose object is outside all cameras' views of the reference."""
     seed = 1_000_000_002
-    sample = synthesize(ObjectSurface(make_object(seed)), torch.ones(32, 64, 3), np.random.default_rng(seed), views=12)
+    light, rng = torch.ones(32, 64, 3), np.random.default_rng(seed)
+    sample = synthesize(ObjectSurface(make_object(seed)), light, rng, size=48, views=12)
 
     def none(*args, **kwargs):
         raise NoSurface("sdf", "expected a surface, got none")
 
     monkeypatch.setattr(heldout, "reconstruct", none)
-    row = evaluate(None, sample, seed, 4, torch.ones(32, 64, 3))
+    row = evaluate(None, sample, seed, 4, light)
     assert row == {"empty": 1.0, "iou": 0.0}
     got = summary([row, {"empty": 0.0, "iou": 1.0, "x_mse": 1e-3}])
     assert (got["objects"], got["empty"], got["iou"]) == (2, 0.5, 0.5) and got["x_psnr"] == pytest.approx(30.0)
     mesh = Mesh(torch.eye(3) * 1e-3 + 50.0, torch.tensor([[0, 1, 2]], dtype=torch.int32))
-    light = Environment(torch.ones(32, 64, 3))
-    away = SimpleNamespace(mesh=mesh, textures=None, environment=light, light=light)
+    away = SimpleNamespace(mesh=mesh, textures=None, light=Environment(light))
     monkeypatch.setattr(heldout, "reconstruct", lambda *args, **kwargs: away)
-    looked = []
-    ground_truth = heldout.reference_colors
-    monkeypatch.setattr(
-        heldout, "reference_colors", lambda seed, cameras: looked.extend(cameras) or ground_truth(seed, cameras)
-    )
-    row = evaluate(None, sample, seed, 4, torch.ones(32, 64, 3))
-    assert torch.equal(torch.stack([c.c2w for c in looked]), sample["c2w"][-8:])  # none of the views that are input
+    looked, seen = [], heldout.seen_colors
+    monkeypatch.setattr(heldout, "seen_colors", lambda s, camera, at: looked.append(camera.c2w) or seen(s, camera, at))
+    row = evaluate(None, sample, seed, 4, light)
+    assert torch.equal(torch.stack(looked[::2]), sample["c2w"][-8:])  # none of the views that are input
     assert (row["empty"], row["iou"]) == (0.0, 0.0) and not any(key.endswith("mse") for key in row)
 
 
@@ -76,9 +73,8 @@ def test_a_sample_of_another_object_is_refused(monkeypatch):
     seed, light = 1_000_000_002, torch.ones(32, 64, 3)
     other = synthesize(ObjectSurface(make_object(seed + 1)), light, np.random.default_rng(0), size=48, views=9)
     mesh = mesh_from(trimesh.creation.icosphere(1))
-    maps = SimpleNamespace(mesh=mesh, textures=None, environment=Environment(light), light=Environment(light))
+    maps = SimpleNamespace(mesh=mesh, textures=None, light=Environment(light))
     monkeypatch.setattr(heldout, "reconstruct", lambda *args, **kwargs: maps)
-    monkeypatch.setattr(heldout, "asset_colors", lambda asset, scene, camera: (torch.ones(48, 48, dtype=bool), light))
     with pytest.raises(InputError, match=f"another object in the sample of seed {seed}"):
         evaluate(None, other, seed, 1, light)
 

@@ -1,6 +1,5 @@
 """The paper's figures against closed forms, and its tables on a ball."""
 
-import inspect
 from dataclasses import replace
 
 import numpy as np
@@ -63,11 +62,6 @@ def place(tmp_path_factory):
     names = [f"{k:02d}" for k in range(12)]
     np.savez(folder / "maps.npz", env=sky * (1 + np.arange(12)[:, None, None, None] / 12), names=names)
     return folder
-
-
-def test_the_pipeline_takes_the_passed_arguments():
-    requested = {"weights", "options"}
-    assert requested <= set(inspect.signature(objects.reconstruct).parameters)
 
 
 def test_the_reference_reconstructed_perfectly_has_perfect_figures(place, monkeypatch):

@@ -20,7 +20,6 @@ from reli3d.render.gbuffer import surface_points
 from tests.support import small_scene
 
 VIEWS, SIZE = 6, 36
-STAGE = maps.MapsStage("maps", until=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +45,8 @@ def unchanged() -> Unknowns:
 
 def fitted(start, images, weights: Weights, steps: int = 40, unknowns: Unknowns | None = None) -> Unknowns:
     unknowns = unknowns or unchanged()
-    views, budget = list(range(VIEWS)), Budget(steps=steps)
-    none = torch.zeros_like(start.mesh.vertices)
-    data = FixedSurface(Start.of(start), start, none, images, views)
-    maps.fit_maps(unknowns, data, weights, budget, STAGE, seed=0)
+    data = FixedSurface(Start.of(start), start, torch.zeros_like(start.mesh.vertices), images, list(range(VIEWS)))
+    maps.fit_maps(unknowns, data, weights, Budget(steps=steps), "maps", 1.0, seed=0)
     return unknowns
 
 
@@ -107,28 +104,27 @@ def test_no_bend_turns_a_normal_away():
     assert float((turned * normal).sum(1).min()) > math.cos(math.asin(MAX_BEND)) - 1e-6
 
 
-def test_an_interrupted_fit_keeps_no_free_bend(start, images, monkeypatch):
+def after_each_step(monkeypatch, act) -> None:
+    """Calls ``act(budget, step)`` after each step of a fit."""
     record = Budget.record
 
-    def pressing(self, name, step, loss):
+    def recording(self, name, step, loss):
         record(self, name, step, loss)
-        self.interrupted = step == 5
+        act(self, step)
 
-    monkeypatch.setattr(Budget, "record", pressing)
+    monkeypatch.setattr(Budget, "record", recording)
+
+
+def test_an_interrupted_fit_keeps_no_free_bend(start, images, monkeypatch):
+    after_each_step(monkeypatch, lambda budget, step: setattr(budget, "interrupted", step == 5))
     unknowns = fitted(start, images, Weights())
     assert unknowns.material[0].abs().max() > 0.0
     assert all(float(grid.abs().max()) == 0.0 for grid in unknowns.bend)
 
 
 def test_the_material_is_frozen_while_the_kept_bend_is_fitted(start, images, monkeypatch):
-    record, seen = Budget.record, []
-
-    def looking(self, name, step, loss):
-        record(self, name, step, loss)
-        seen.append((unknowns.material[0].clone(), unknowns.light[0].clone()))
-
-    monkeypatch.setattr(Budget, "record", looking)
-    unknowns = unchanged()
+    unknowns, seen = unchanged(), []
+    after_each_step(monkeypatch, lambda *_: seen.append((unknowns.material[0].clone(), unknowns.light[0].clone())))
     fitted(start, images, Weights(), 20, unknowns)
     first = int(maps.MATERIAL_UNTIL * 20)
     assert not torch.equal(seen[first - 2][0], seen[first - 1][0])

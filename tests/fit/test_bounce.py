@@ -113,8 +113,8 @@ def test_a_fit_of_maps_includes_interreflection(monkeypatch):
 
     def loss(weight: float, independent: bool) -> float:
         rows = replace(shown, received=weight * pixels.received)
-        estimate = maps.Estimate(None, (1, 0, 0), seed=0, independent=independent)
-        return float(maps.maps_loss(unknowns, data, rows, pixels.order, weights, estimate))
+        options = dict(scene=None, samples=(1, 0, 0), seed=0, independent=independent)
+        return float(maps.maps_loss(unknowns, data, rows, pixels.order, weights, **options))
 
     assert loss(1.0, False) < 1e-10 < 1e-4 < loss(0.5, False)
     assert loss(0.5, True) == loss(0.5, False)  # both estimates include it, and there is no noise

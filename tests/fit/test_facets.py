@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from reli3d.fit import facets
-from reli3d.fit.facets import flattened, neighbor_faces
+from reli3d.fit.facets import flattened
 from reli3d.fit.unknowns import unit
 from reli3d.geometry.mesh import Mesh, face_normals
 from reli3d.geometry.smooth import taubin_smooth
@@ -26,12 +26,6 @@ def off_axis(mesh: Mesh) -> torch.Tensor:
     """Angle [degrees] of each face's normal to the nearest axis."""
     normal = unit(face_normals(mesh.vertices, mesh.faces))
     return torch.rad2deg(normal.abs().amax(1).clamp(max=1.0).acos())
-
-
-def test_each_face_knows_the_face_across_each_edge():
-    faces = torch.tensor([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]], dtype=torch.int32)
-    assert neighbor_faces(faces).tolist() == [[1, 2, 3], [3, 2, 0], [1, 3, 0], [2, 1, 0]]
-    assert neighbor_faces(faces[:2]).tolist() == [[1, 0, 0], [1, 1, 0]]  # an open edge has the face itself
 
 
 def test_noise_goes_and_edges_stay():

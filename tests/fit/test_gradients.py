@@ -103,11 +103,10 @@ def test_the_gradient_of_the_bend_matches_central_differences(terms, monkeypatch
     rng = torch.Generator().manual_seed(3)
     for grid in unknowns.bend:
         grid += 0.1 * torch.randn(grid.shape, generator=rng)
-    estimate = maps.Estimate(None, LIGHT, seed=1, independent=False)
+    weights, options = Weights(**{**NONE, **terms}), dict(scene=None, samples=LIGHT, seed=1, independent=False)
 
     def loss() -> Tensor:
-        weights = Weights(**{**NONE, **terms})
-        return maps.maps_loss(unknowns, surface, pixels, pixels.order[:400], weights, estimate)
+        return maps.maps_loss(unknowns, surface, pixels, pixels.order[:400], weights, **options)
 
     got, expected = directional_derivatives(loss, unknowns.bend, towards("all", unknowns.bend), 1e-3)
     assert got == pytest.approx(expected, rel=0.02)  # float32 sums of 400 points

@@ -26,11 +26,6 @@ def test_the_log_chromaticity_of_the_lighting_is_scaled_and_products_stay_the_sa
     torch.testing.assert_close(*products)
 
 
-def test_weight_one_keeps_the_start():
-    start = replace(small_scene.ball(), environment=lit([1.2, 1.0, 0.8]))
-    assert torch.equal(with_neutral_light(start, 1.0).light.radiance, start.light.radiance)
-
-
 def test_gray_and_black_lighting_stay_the_same_and_strong_colors_change_by_a_limited_factor():
     for color in ([0.7, 0.7, 0.7], [0.0, 0.0, 0.0]):
         start = replace(small_scene.ball(), environment=lit(color))

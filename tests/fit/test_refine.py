@@ -12,11 +12,11 @@ from reli3d.fit import transfer
 from reli3d.fit.budget import Budget
 from reli3d.fit.choice import PSNR_TOLERANCE_DB, Fitted, Parts
 from reli3d.fit.input_images import InputImages
-from reli3d.fit.losses import Weights, agreement, display_error, hue_drift, palette
+from reli3d.fit.losses import LIGHT_PRIOR_VIEWS, Weights, agreement, display_error, hue_drift, palette, priors
 from reli3d.fit.transfer import transfer_textures
 from reli3d.fit.unknowns import Start, Unknowns, corrected
 from reli3d.geometry.camera import project
-from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.asset import TextureSet
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.views.views import Views
@@ -78,11 +78,11 @@ def test_the_surface_moves_towards_the_silhouettes(refined, start):
     assert off[1] < 0.6 * off[0]  # the squeezed ball grows back; between the silhouettes of six views some is free
 
 
-def test_the_same_steps_and_seed_give_bitwise_identical_results(refined, start, views):
-    again = fit.refine(start, views, steps=STEPS, options=fit.RefineOptions(24, seed=3))
-    assert torch.equal(again.asset.mesh.vertices, refined.asset.mesh.vertices)
-    assert torch.equal(again.asset.textures.base_color, refined.asset.textures.base_color)
-    assert torch.equal(again.asset.environment.radiance, refined.asset.environment.radiance)
+def test_the_same_steps_and_seed_give_bitwise_identical_results(start, views):
+    one, two = (fit.refine(start, views, steps=12, options=fit.RefineOptions(24, seed=3)).asset for _ in range(2))
+    assert torch.equal(one.mesh.vertices, two.mesh.vertices) and one is not start
+    assert torch.equal(one.textures.base_color, two.textures.base_color)
+    assert torch.equal(one.environment.radiance, two.environment.radiance)
 
 
 def test_a_worse_result_gives_the_start_and_is_reported(start, views, monkeypatch):
@@ -156,16 +156,11 @@ def test_masks_that_do_not_overlap_keep_the_surface(start, views):
     assert result.parts.surface == 0.0 and sum("do not overlap" in note for note in result.notes) == 1
 
 
-@pytest.mark.parametrize("case", ["textures of 4 texels", "no tangents", "gradients"])
-def test_every_textured_surface_is_a_start(start, views, case):
-    mesh, textures = start.mesh, start.textures
-    if case == "gradients":
-        mesh = replace(mesh, vertices=mesh.vertices.clone().requires_grad_(True))
-    elif case == "no tangents":
-        mesh = replace(mesh, tangents=None)
-    else:
-        textures = TextureSet(torch.full((4, 4, 3), 0.3), 0.6, 0.1)
-    result = fit.refine(replace(start, mesh=mesh, textures=textures), views, steps=12, options=fit.RefineOptions(24))
+def test_every_textured_surface_is_a_start(start, views):
+    """Textures of 4 texels, no tangents, vertices that require gradients."""
+    mesh = replace(start.mesh, vertices=start.mesh.vertices.clone().requires_grad_(True), tangents=None)
+    first = replace(start, mesh=mesh, textures=TextureSet(torch.full((4, 4, 3), 0.3), 0.6, 0.1))
+    result = fit.refine(first, views, steps=12, options=fit.RefineOptions(24))
     assert result.parts.surface == 1.0 and not result.asset.mesh.vertices.requires_grad
 
 
@@ -183,19 +178,17 @@ def test_an_open_surface_keeps_its_shape(start, views):
 
 
 def test_what_does_not_fit_together_is_refused(start, views):
-    with pytest.raises(ValueError, match="environment: expected an environment"):
-        fit.refine(replace(start, environment=None), views, steps=1)
-    with pytest.raises(ValueError, match="asset.textures: expected textures"):
-        fit.refine(Asset(start.mesh, None, start.environment), views, steps=1)
     tiled = replace(start.mesh, faces=start.mesh.faces[:-40], uv=2.0 * start.mesh.uv)
-    with pytest.raises(ValueError, match="asset.mesh.uv: expected .* on an open surface"):
-        fit.refine(replace(start, mesh=tiled), views, steps=1)
-    with pytest.raises(ValueError, match="masks: expected"):
-        InputImages.of(replace(views, masks=views.masks[:, 1:]))
-    with pytest.raises(ValueError, match="seconds, steps: expected one"):
-        fit.refine(start, views)
-    with pytest.raises(ValueError, match="steps: expected at least 1"):
-        Budget(steps=0)
+    for call, message in (
+        (lambda: fit.refine(replace(start, environment=None), views, steps=1), "environment: expected an environment"),
+        (lambda: fit.refine(replace(start, textures=None), views, steps=1), "asset.textures: expected textures"),
+        (lambda: fit.refine(replace(start, mesh=tiled), views, steps=1), "asset.mesh.uv: expected .* on an open surf"),
+        (lambda: InputImages.of(replace(views, masks=views.masks[:, 1:])), "masks: expected"),
+        (lambda: fit.refine(start, views), "seconds, steps: expected one"),
+        (lambda: Budget(steps=0), "steps: expected at least 1"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_steps_are_divided_among_the_parts():
@@ -245,6 +238,21 @@ def test_the_mean_hue_is_held_and_neither_brightness_nor_patterns():
     assert float(hue_drift(start - 0.7 + pattern, start)) < 1e-9
     # a factor of e on red alone: drifts of 2/3, -1/3 and -1/3, mean square (4 + 1 + 1) / 27
     assert float(hue_drift(start + torch.tensor([1.0, 0.0, 0.0]), start)) == pytest.approx(6 / 27, rel=1e-5)
+
+
+def test_priors_of_the_lighting_fall_with_the_squared_number_of_views_per_lighting():
+    def of_lights(views: int, lights: int) -> float:
+        """The priors of one change of the lighting, given to each of ``lights`` lightings, and nothing else."""
+        unknowns = Unknowns.zero(torch.ones(2, 2, 2), views, 4, lights)
+        for grid in unknowns.light:
+            grid[:] = torch.linspace(-1, 1, grid[0].numel()).view(grid[0].shape)
+        return float(priors(unknowns, Weights(), views))
+
+    for lights in (1, 2):
+        most = LIGHT_PRIOR_VIEWS * lights
+        full = of_lights(most, lights)
+        assert full > 0 and of_lights(most // 2, lights) == pytest.approx(full)
+        assert of_lights(2 * most, lights) == pytest.approx(full / 4)
 
 
 def test_maps_move_to_another_surface():

@@ -130,9 +130,9 @@ def shading_inputs(device, n=6, seed=3):
 
 
 def test_gradients_stay_finite_at_the_edges(device):
-    """A hundred thousand points: mirrors and rough, metals, black; views along the normal, in the surface, behind it;
+    """Twenty thousand points: mirrors and rough, metals, black; views along the normal, in the surface, behind it;
     lobes along the normal or the view of one of them, against it, nearly constant and as sharp as a laser."""
-    n, rng = 100_000, torch.Generator().manual_seed(5)
+    n, rng = 20_000, torch.Generator().manual_seed(5)
     normal, wo, base, rough, metal = shading_inputs("cpu", n)
     kind = torch.arange(n) % 16
     rough[kind < 4], rough[kind == 4] = 0.0, 1.0
@@ -154,7 +154,7 @@ def test_gradients_stay_finite_at_the_edges(device):
 
 def test_bad_input_and_empty_batches(device):
     axis, sharpness, amplitude = lobes(device)
-    with pytest.raises(ValueError, match="expected \\(K, 3\\)"):
+    with pytest.raises(ValueError, match="sharpness: expected shape"):
         SphericalGaussians(axis, sharpness[:2], amplitude)
     light = SphericalGaussians(axis, sharpness, amplitude)
     rows = shading_inputs(device)

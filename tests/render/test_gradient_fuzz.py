@@ -205,7 +205,7 @@ def test_all_strategies_together_keep_their_gradients_finite(device, light, opti
     points = at(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), *leaves[1:4])
     out = lit(points, Environment(leaves[4]), samples=(2, 4, 1), alpha="linear", **options)
     grads = torch.autograd.grad(out.sum(), leaves)
-    assert all(bool(torch.isfinite(v).all()) for v in (out, *grads))
+    assert all(bool(torch.isfinite(v).all()) for v in (out, *grads)) and float(out.detach().min()) >= 0.0
     # no light, no gradient except the light's
     assert light == "sun" or all(float(g.abs().max()) == 0.0 for g in grads[:4])
     assert float(grads[4].abs().max()) > 0.0

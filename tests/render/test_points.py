@@ -29,11 +29,17 @@ def test_one_row_and_plain_numbers_hold_for_all_points(device):
     flat = shade(SurfacePoints(normal, normal[0], normal[:1], 0.5, 0.3, 0), wo[0], light)
     rows = [v.expand(300, 3) for v in (normal[:1], normal[:1], color.new_full((1, 3), 0.5))]
     assert torch.equal(flat, shade(SurfacePoints(normal, *rows, one, 0 * one), wo[:1].expand(300, 3), light))
-    part = SurfacePoints(normal, normal, normal, color, 0.3, 0.0)[100:200]
-    assert len(part) == 100 and torch.equal(
-        shade(part, wo[100:200], light, pixels=torch.arange(100, 200, dtype=torch.int32, device=device)),
-        shade(SurfacePoints(normal, normal, normal, color, 0.3, 0.0), wo, light)[100:200],
-    )
+
+
+def test_a_part_of_points_has_the_bits_of_the_whole(device):
+    """With shadows, whose rays are traced in chunks; none and no samples too."""
+    normal, wo = (v.to(device) for v in points(6000))
+    whole, light = SurfacePoints(normal, normal, normal, normal.abs(), 0.3, 0.0), Environment(sky().radiance.to(device))
+    scene, ids = shadow_caster(device), torch.arange(700, 900, dtype=torch.int32, device=device)
+    part = shade(whole[700:900], wo[700:900], light, scene=scene, pixels=ids)
+    assert len(part) == 200 and torch.equal(part, shade(whole, wo, light, scene=scene)[700:900])
+    assert shade(whole[:0], wo[:0], light).shape == (0, 3)
+    assert float(shade(whole, wo, light, options=ShadeOptions(samples=(0, 0, 0))).abs().max()) == 0.0
 
 
 @pytest.mark.parametrize("name", ["normal", "ng", "base_color", "roughness", "metallic", "position", "wo"])

@@ -3,7 +3,6 @@
 import math
 from dataclasses import fields, replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -15,9 +14,7 @@ from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.image import render_asset, render_lights
-from reli3d.render.material import DIFFUSE_MODELS
 from reli3d.render.shading import ShadeOptions
-from tests.support import reference
 from tests.support.scenes import ball, eye, textures
 
 
@@ -49,25 +46,18 @@ def test_rays_and_projection_are_inverse(device):
 
 
 def test_texture_lookup_is_bilinear_and_repeats(device):
-    t = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
+    t = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0)).to(device)
     k = (torch.arange(8, device=device) + 0.5) / 8
     grid = torch.stack(torch.meshgrid(k, k, indexing="ij")[::-1], -1)
     torch.testing.assert_close(sample_texture(t, grid), t, rtol=0, atol=1e-6)
     torch.testing.assert_close(sample_texture(t, grid + torch.tensor([3.0, -2.0], device=device)), t, rtol=0, atol=1e-5)
-    uv = torch.rand(5000, 2, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
+    uv = torch.rand(5000, 2, generator=torch.Generator().manual_seed(1)).to(device)
     padded = torch.nn.functional.pad(t.double().permute(2, 0, 1)[None], (1, 1, 1, 1), mode="circular")
     expected = torch.nn.functional.grid_sample(
         padded, ((uv.double() * 8 + 1) / 10 * 2 - 1)[None, None], align_corners=False
     )
     got = sample_texture(t, uv)
     torch.testing.assert_close(got.double(), expected[0, :, 0].T, rtol=0, atol=1e-5)
-    weight = torch.randn(5000, 3, generator=torch.Generator().manual_seed(2)).to(device)
-    for a, b in zip(
-        torch.autograd.grad((got * weight).sum(), (t, uv)),
-        torch.autograd.grad((expected[0, :, 0].T * weight.double()).sum(), (t, uv)),
-        strict=True,
-    ):
-        assert reference.fraction_within(a, b) >= 0.999
 
 
 @pytest.mark.parametrize("explicit", [True, False])
@@ -214,51 +204,33 @@ def test_image_gradient_reaches_textures_and_light(device):
 
 def test_no_light_is_gained_at_the_rim_except_by_the_published_diffuse_model(device):
     """A smooth white ball in a furnace.  Rays from below the horizon never hit it, so it shadows nothing itself."""
-    asset = ball(device, (1.0, 1.0, 1.0))
-    camera, white = (
-        Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 40, 40),
-        Environment.constant(torch.ones(3, device=device)),
-    )
-    asset = Asset(asset.mesh, textures(4, device, (1.0, 1.0, 1.0), roughness=0.2))
-    images = {
-        diffuse_model: render_asset(
-            asset, camera, white, options=ShadeOptions(samples=(64, 64, 64), diffuse_model=diffuse_model)
-        )
-        for diffuse_model in DIFFUSE_MODELS
-    }
-    inside = images["published"].alpha > 0
-    bright = {diffuse_model: image.radiance[inside] for diffuse_model, image in images.items()}
+    asset = replace(ball(device), textures=textures(4, device, (1.0, 1.0, 1.0), roughness=0.2))
+    camera = Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 40, 40)
+    white, bright = Environment.constant(torch.ones(3, device=device)), {}
+    for model in ({"diffuse_model": "published"}, {"diffuse_model": "conserving"}, {}):
+        image = render_asset(asset, camera, white, options=ShadeOptions(samples=(64, 64, 64), **model))
+        bright[model.get("diffuse_model")] = image.radiance[image.alpha > 0]
     assert float(bright["published"].max()) > 1.1
     assert float(bright["conserving"].max()) < 1.05 and float(bright["conserving"].mean()) > 0.85  # 192 samples' noise
-    assert torch.equal(
-        images["conserving"].radiance,
-        render_asset(asset, camera, white, options=ShadeOptions(samples=(64, 64, 64))).radiance,
-    )
+    assert torch.equal(bright["conserving"], bright[None])
 
 
 def test_bad_input_is_named(device):
     asset, camera = ball(device), Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 4, 4)
-    with pytest.raises(ValueError, match="environment: expected"):
-        render_asset(asset, camera)
-    with pytest.raises(ValueError, match="background: expected"):
-        render_asset(asset, camera, Environment.constant(torch.ones(3, device=device)), background="pink")
-    with pytest.raises(ValueError, match="diffuse_model: expected"):
-        render_asset(
-            asset,
-            camera,
-            Environment.constant(torch.ones(3, device=device)),
-            options=ShadeOptions(diffuse_model="white"),
-        )
-    faces, values = asset.mesh.faces, asset.mesh.vertices
-    with pytest.raises(ValueError, match="face: expected"):
-        interpolate(
-            values,
-            faces,
-            torch.tensor([len(faces)], dtype=torch.int32, device=device),
-            torch.zeros(1, 2, device=device),
-        )
-    with pytest.raises(ValueError, match="uv: expected"):
-        sample_texture(asset.textures.normal, torch.tensor([[np.nan, 0.0]], dtype=torch.float32, device=device))
+    light, vertices, faces = Environment.constant(torch.ones(3, device=device)), asset.mesh.vertices, asset.mesh.faces
+    bary, outside = torch.zeros(1, 2, device=device), torch.tensor([len(faces)], dtype=torch.int32, device=device)
+    for call, message in (
+        (lambda: render_asset(asset, camera), "environment: expected"),
+        (lambda: render_asset(asset, camera, light, background="pink"), "background: expected"),
+        (
+            lambda: ShadeOptions(diffuse_model="white"),
+            "diffuse_model: expected one of conserving, pub",
+        ),
+        (lambda: interpolate(vertices, faces, outside, bary), "face: expected"),
+        (lambda: sample_texture(asset.textures.normal, bary * math.nan), "uv: expected"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_parts_shadow_each_other_and_keep_their_base_color(device):
@@ -274,21 +246,3 @@ def test_parts_shadow_each_other_and_keep_their_base_color(device):
     alone = render_asset(parts[1:], camera, Environment.constant(torch.ones(3, device=device)))
     near = below & (image.position.norm(dim=-1) < 0.9)
     assert float(image.radiance[near].mean()) < 0.9 * float(alone.radiance[near].mean())
-
-
-def test_lookups_follow_the_maps(device):
-    maps = textures(8, device, (0.5, 0.2, 0.1), roughness=0.3)
-    with torch.inference_mode():
-        assert maps.rough_metal().is_inference()
-    first = maps.rough_metal()
-    assert not first.is_inference()
-    assert maps.rough_metal() is first  # kept
-    maps.roughness.fill_(0.9)
-    again = maps.rough_metal()
-    assert float(again[..., 0].min()) == pytest.approx(0.9) and float(first[..., 0].max()) == pytest.approx(0.3)
-    leaf = TextureSet(maps.base_color, maps.roughness.clone().requires_grad_(), 0.0)
-    for _ in range(2):  # a graph for each
-        leaf.rough_metal().sum().backward()
-    assert float(leaf.roughness.grad.min()) > 0
-    with torch.inference_mode():
-        torch.testing.assert_close(textures(8, device).rough_metal()[..., 0], torch.full((8, 8), 0.5, device=device))

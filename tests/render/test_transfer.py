@@ -10,7 +10,7 @@ import trimesh
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
-from reli3d.render.transfer import blocked_transfer, light_harmonics, sphere_spiral, spherical_harmonics
+from reli3d.render.transfer import blocked_transfer, light_harmonics, spherical_harmonics
 from tests.support.meshes import mesh_from
 
 COSINE = torch.tensor([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5 + [0.0] * 7).double()  # an open plane's
@@ -112,13 +112,6 @@ def test_missing_irradiance_is_that_of_a_monte_carlo_estimate(device):
             (blocked_transfer(mesh, directions=directions)[chosen] @ light_harmonics(light) - expected) / whole
         ).abs()
         assert error.mean() < mean and error.max() < most, (directions, error.mean(), error.max())
-
-
-def test_the_spiral_sums_as_an_integral_does():
-    y = spherical_harmonics(sphere_spiral(64).double())
-    torch.testing.assert_close(
-        y.mean(0), torch.tensor([math.sqrt(1 / (4 * math.pi))] + [0.0] * 15).double(), rtol=0, atol=0.02
-    )
 
 
 def test_invalid_inputs_are_refused():
