@@ -69,7 +69,8 @@ class _SampleTriplane(torch.autograd.Function):
         if packed is None:
             return g_planes, None
         at, g_points = points.view(-1, 3), torch.empty_like(points)
-        sizes = sizes_of(points.shape[1], *ctx.shape[3:], packed.shape[-1] // BLOCK_CHANNELS)
+        height, width = ctx.shape[3:]
+        sizes = sizes_of(points.shape[1], height, width, packed.shape[-1] // BLOCK_CHANNELS)
         args = [packed.view(-1, BLOCK_CHANNELS), at, g.view(-1, BLOCK_CHANNELS), sizes, g_points.view(-1, 3)]
         launch(kernels.points_adjoint_kernel, len(at), args, points.device)
         return g_planes, g_points
