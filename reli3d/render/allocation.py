@@ -126,8 +126,10 @@ def _draw(
     with its own below the horizon, have weight 1; then a constant integrand has variance 0.
     """
     n, count, device = len(values[0]), 3 * each, values[0].device
-    own = dict(samples=(each,) * 3, seed=options.seed, antithetic="none", diffuse_model=options.diffuse_model)
-    plan, offsets = sampling_plan(replace(DEFAULT, **own), scene)
+    options = replace(
+        DEFAULT, samples=(each,) * 3, seed=options.seed, antithetic="none", diffuse_model=options.diffuse_model
+    )
+    plan, offsets = sampling_plan(options, scene)
     light = struct_of_light(environment.radiance.contiguous(), environment.cdf, offsets.to(device))
     pixels = torch.arange(n, dtype=torch.int32, device=device)
     ins = [struct_of_points([v.contiguous() for v in values], pixels), light, plan]
@@ -150,8 +152,8 @@ def _measured_variance(
     """Measured variance of :func:`reli3d.render.shading.shade` with ``counts``, weighted mean over the points."""
     runs = TRIAL_POINTS // len(weights)
     position, normal, ng, wo, *material = (v.repeat(runs, *[1] * (v.ndim - 1)) for v in values)
-    given = dict(samples=counts.tolist(), antithetic="none", alpha="linear", heuristic="balance", clamp=None)
-    options = replace(options, **given)
+    samples = Samples(*counts.int().tolist())
+    options = replace(options, samples=samples, antithetic="none", alpha="linear", heuristic="balance", clamp=None)
     drawn = shade(SurfacePoints(position, ng, normal, *material), wo, environment, scene=scene, options=options)
     return float(weights @ drawn.double().unflatten(0, (runs, -1)).var(0).sum(1))
 
