@@ -126,9 +126,10 @@ def _draw(
     with its own below the horizon, have weight 1; then a constant integrand has variance 0.
     """
     n, count, device = len(values[0]), 3 * each, values[0].device
-    samples, model = Samples(each, each, each), options.diffuse_model
-    own = replace(DEFAULT, samples=samples, seed=options.seed, antithetic="none", diffuse_model=model)
-    plan, offsets = sampling_plan(own, scene)
+    options = replace(
+        DEFAULT, samples=(each,) * 3, seed=options.seed, antithetic="none", diffuse_model=options.diffuse_model
+    )
+    plan, offsets = sampling_plan(options, scene)
     light = struct_of_light(environment.radiance.contiguous(), environment.cdf, offsets.to(device))
     pixels = torch.arange(n, dtype=torch.int32, device=device)
     ins = [struct_of_points([v.contiguous() for v in values], pixels), light, plan]

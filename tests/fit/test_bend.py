@@ -43,7 +43,7 @@ def unchanged() -> Unknowns:
     return Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
 
 
-def fitted(start, images, weights: Weights, steps: int = 40, unknowns: Unknowns | None = None) -> Unknowns:
+def fitted(start, images, weights: Weights, steps: int = 24, unknowns: Unknowns | None = None) -> Unknowns:
     unknowns = unknowns or unchanged()
     data = FixedSurface(Start.of(start), start, torch.zeros_like(start.mesh.vertices), images, list(range(VIEWS)))
     maps.fit_maps(unknowns, data, weights, Budget(steps=steps), "maps", 1.0, seed=0)
