@@ -11,6 +11,7 @@ from reli3d.capture import fusion
 from reli3d.capture.fusion import fused_masks
 from reli3d.capture.mapping import Map, View
 from reli3d.capture.photos import Photo
+from reli3d.capture.rigidity import Frame
 from reli3d.capture.scene import Plane, Scene
 from tests.support.mapped import view
 
@@ -101,7 +102,7 @@ def test_texels_that_enough_views_show_outside_the_masks_have_the_colors_of_the_
     """Two low parts, missing in the cover: the first is in the masks of 6 of 10 views, the other in those of 7."""
     plane, part, radius, at = 100, 200, 0.15, ((-0.4, 0.0), (0.4, 0.0))
     scene = Scene(np.zeros(3), 2.4, Plane(np.array([0.0, 0, 1]), 0.0), np.zeros(0, bool), np.zeros(0, bool))
-    axes = fusion._Axes(np.zeros(3), scene.plane.axes)
+    axes = Frame(1.0, scene.plane.axes.T, np.zeros(3))
     smalls, inside, cover = [], [], []
     for k in range(10):
         azimuth = 2 * np.pi * k / 10
@@ -118,7 +119,7 @@ def test_texels_that_enough_views_show_outside_the_masks_have_the_colors_of_the_
         inside.append(low.reshape(h, w))
         cover.append(np.zeros((h, w), bool))
     texture = fusion._plane_texture(smalls, inside, cover, axes, scene)
-    index = np.array([[*place, 0.0] for place in at]) @ axes.axes[:2].T / texture.cell + len(texture.color) / 2
+    index = np.array([[*place, 0.0] for place in at]) @ axes.turn[:, :2] / texture.cell + len(texture.color) / 2
     first, other = (texture.color[v, u] for u, v in index.astype(int))
     assert np.abs(first - plane).max() < 1  # 4 views show it outside the masks; the median of all shows the part
     assert np.abs(other - part).max() < 1  # only 3: all are taken
