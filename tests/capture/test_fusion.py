@@ -19,13 +19,19 @@ RADIUS, GRAY = 0.35, 90.0
 SHADOW = 50  # texels of 0.01
 
 
+def rays_of(camera: View) -> np.ndarray:
+    """Through the centers of its pixels, row by row."""
+    w, h = camera.photo.size
+    y, x = np.mgrid[:h, :w] + 0.5
+    return camera.rays(np.stack([x, y], -1).reshape(-1, 2))
+
+
 def pictured(k: int, eye: np.ndarray, texture: np.ndarray) -> tuple[View, np.ndarray, np.ndarray]:
     """A gray ball on a textured plane ``z = -RADIUS`` before a wall of the same gray, its mask, and the mask of its
     contact shadow, by ray casting."""
     camera = view(k, eye)
     w, h = camera.photo.size
-    y, x = np.mgrid[:h, :w] + 0.5
-    rays = camera.rays(np.stack([x, y], -1).reshape(-1, 2))
+    rays = rays_of(camera)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     along = rays @ eye
     ball = (along**2 - (eye @ eye - RADIUS**2) > 0) & (along < 0)
@@ -108,8 +114,7 @@ def test_texels_that_enough_views_show_outside_the_masks_have_the_colors_of_the_
         azimuth = 2 * np.pi * k / 10
         camera = view(k, 2.4 * np.array([np.cos(azimuth), np.sin(azimuth), 1.0]) / np.sqrt(2))
         w, h = camera.photo.size
-        y, x = np.mgrid[:h, :w] + 0.5
-        rays = camera.rays(np.stack([x, y], -1).reshape(-1, 2))
+        rays = rays_of(camera)
         shown = (camera.eye - camera.eye[2] / rays[:, 2:] * rays)[:, :2]  # of the plane z = 0
         low = np.zeros(h * w, bool)
         for place, views in zip(at, (6, 7), strict=True):
