@@ -32,7 +32,8 @@ def hull_mask(pixels: np.ndarray) -> np.ndarray:
     return cv2.dilate(mask, np.ones((5, 5), np.uint8))
 
 
-def map_of(views, matches=(), points=np.zeros((0, 3))) -> Map:
+def map_of(views, matches=(), points=()) -> Map:
+    points = np.reshape(points, (-1, 3))
     return Map(tuple(views), points, np.zeros(len(points)), np.full(len(points), 3), tuple(matches))
 
 
