@@ -118,7 +118,7 @@ def render_capture(
     light = rows * torch.tensor(rng.uniform(0.5, 1.5, (32, 64, 1)), dtype=torch.float32) if turntable else rows.clone()
     light[4:8, 10:18] = 6.0
     sky = Environment(light.contiguous())
-    samples = Samples(light=4, bsdf=2, cosine=2)
+    samples = Samples(light=2, bsdf=1, cosine=1)
     images, masks, poses = [], [], []
     pooled = torch.nn.functional.avg_pool2d
     for k in range(views):
