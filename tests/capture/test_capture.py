@@ -22,7 +22,7 @@ from tests.support.rigs import eyes_around, sphere_views
 
 @pytest.fixture(scope="module")
 def ground_truth():
-    return render_capture(views=20)
+    return render_capture(views=16, heights=(29, 39))
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_cameras_are_those_of_the_scene(ground_truth, captured):
     report, folder = captured
     assert report.registered == len(ground_truth.images) and not report.lost
     check_cameras(ground_truth, folder)
-    assert report.object_points > 480  # 559; 399 if each pair of images judges its matches by its own geometry
+    assert report.object_points > 400  # 456; 361 if each pair of images judges its matches by its own geometry
 
 
 def test_two_runs_write_equal_files(ground_truth, captured, tmp_path):
@@ -72,7 +72,7 @@ def test_two_runs_write_equal_files(ground_truth, captured, tmp_path):
     _, folder = captured
     capture(ground_truth.write(tmp_path / "photographs"), tmp_path / "object")
     files = [p.relative_to(folder) for p in sorted(folder.rglob("*")) if p.is_file()]
-    assert len(files) > 40
+    assert len(files) > 30
     assert all((folder / p).read_bytes() == (tmp_path / "object" / p).read_bytes() for p in files)
 
 

@@ -93,11 +93,12 @@ def render_capture(
     views: int = 20,
     size: tuple[int, int] = (400, 300),
     *,
+    heights: tuple[float, float] = (24, 46),
     moved_after: int | None = None,
     turntable: bool = False,
     passerby: bool = False,
 ) -> TrueCapture:
-    """A ring of hand-held views at two heights under a sky; cameras are relative to the object.
+    """A ring of hand-held views at two heights [degrees] under a sky; cameras are relative to the object.
 
     moved_after: from this view on the object is elsewhere on the table.  turntable: the camera is fixed, the object
     turns with a small table in front of a textured background.  passerby: something upright moves behind the table.
@@ -107,7 +108,7 @@ def render_capture(
     focal = 1.4 * width
     steps = np.arange(views)
     azimuth = 2 * np.pi * (steps + (0 if turntable else 1) * rng.uniform(-0.2, 0.2, views)) / views
-    elevation = np.radians(np.where(steps % 2 == 0, 24, 46) + rng.uniform(-3, 3, views))
+    elevation = np.radians(np.where(steps % 2 == 0, *heights) + rng.uniform(-3, 3, views))
     distance = 2.9 * rng.uniform(0.92, 1.08, views)
     target, roll = rng.normal(0, 0.03, (views, 3)), rng.normal(0, 0.04, (views, 3))
     if turntable:
@@ -118,7 +119,7 @@ def render_capture(
     light = rows * torch.tensor(rng.uniform(0.5, 1.5, (32, 64, 1)), dtype=torch.float32) if turntable else rows.clone()
     light[4:8, 10:18] = 6.0
     sky = Environment(light.contiguous())
-    samples = Samples(light=2, bsdf=1, cosine=1)
+    samples = Samples(light=4, bsdf=2, cosine=2)
     images, masks, poses = [], [], []
     pooled = torch.nn.functional.avg_pool2d
     for k in range(views):
