@@ -189,11 +189,10 @@ def write_video(target, images, *, crf: int = 12, dst_colorspace: str | None = N
     """target: a path, or what has ``write``.  tags: of the codec."""
     with av.open(target, "w", format=form, options={"movflags": "faststart"} if form is None else {}) as file:
         stream = file.add_stream("libx264", rate=30, options={"crf": str(crf)})
-        stream.pix_fmt = "yuv420p"
+        (stream.width, stream.height), stream.pix_fmt = images[0].size, "yuv420p"
         for name, value in tags.items():
             setattr(stream.codec_context, name, value)
         for image in images:
-            stream.width, stream.height = image.size
             frame = av.VideoFrame.from_image(image)
             file.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace=dst_colorspace)))
         file.mux(stream.encode())
@@ -201,7 +200,7 @@ def write_video(target, images, *, crf: int = 12, dst_colorspace: str | None = N
 
 def test_a_video_without_a_length_is_read_to_its_end_with_square_pixels(tmp_path):
     path = tmp_path / "stream.mkv"
-    images = (Image.fromarray(textured(k // 2)) for k in range(2 * FRAME_COUNT))
+    images = [Image.fromarray(textured(k // 2)) for k in range(2 * FRAME_COUNT)]
     with path.open("wb") as file:
         sink = SimpleNamespace(write=file.write)  # cannot be rewound, as a pipe: the file has no length
         write_video(sink, images, form="matroska", sample_aspect_ratio=Fraction(4, 3), color_trc=16)  # PQ
@@ -318,7 +317,7 @@ def test_the_sharpest_frame_of_each_window_of_a_video_is_taken(tmp_path):
     path = tmp_path / "clip.mp4"
     sharp = [Image.fromarray(textured(k)) for k in range(FRAME_COUNT)]
     blurred = [image.resize((20, 15), Image.Resampling.BOX).resize((320, 240)) for image in sharp]
-    write_video(str(path), (image for three in zip(blurred, sharp, blurred, strict=True) for image in three))
+    write_video(str(path), [image for three in zip(blurred, sharp, blurred, strict=True) for image in three])
     photos, notes = read_photos(path, quiet)
     assert len(photos) == FRAME_COUNT
     assert min(sharpness(p.pixels) for p in photos) > 0.5 * sharpness(textured(0))  # blurred ones have a tenth
