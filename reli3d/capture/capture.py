@@ -537,8 +537,8 @@ def _write(output: Path, views, masks, frame: Frame, box: np.ndarray, report: Ca
             lens = {"fl_x": view.focal, "fl_y": view.focal, "cx": cx, "cy": cy, "w": w, "h": h}
             frames.append({**paths, "transform_matrix": pose.tolist(), **lens})
             thumbnails.append((name, image, mask, replace(view, radial=0.0)))
-        content = {"camera_model": "PINHOLE", "lighting": report.lighting, "unit": report.unit}
-        content |= {"object_box": box.tolist(), "frames": frames}
+        facts = {"camera_model": "PINHOLE", "lighting": report.lighting, "unit": report.unit}
+        content = {**facts, "object_box": box.tolist(), "frames": frames}
         (work / "transforms.json").write_text(json.dumps(content, indent=1))
         (work / "capture.json").write_text(json.dumps(asdict(report), indent=1))
         eyes = np.stack([frame.apply(v.eye) for v in views])
