@@ -77,7 +77,8 @@ def test_two_runs_write_equal_files(ground_truth, captured, tmp_path):
 
 
 @pytest.mark.slow
-def test_alpha_of_cut_out_photographs_is_used_as_masks(ground_truth, tmp_path):
+def test_alpha_of_cut_out_photographs_is_used_as_masks(tmp_path):
+    ground_truth = render_capture(views=20)
     photographs = tmp_path / "photographs"
     photographs.mkdir()
     for k, (image, mask) in enumerate(zip(ground_truth.images, ground_truth.masks, strict=True)):
