@@ -23,7 +23,7 @@ from reli3d._bridge import expect, full_precision, present
 from reli3d.errors import InputError
 from reli3d.geometry.bake import bake
 from reli3d.geometry.cover import FIELD_MAX, cover_silhouettes
-from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
+from reli3d.geometry.mesh import Mesh, largest_components, weld
 from reli3d.geometry.normals import displace_to_normals
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
@@ -76,14 +76,12 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False) -> F
     background: whether the illumination branch of a :class:`~reli3d.nn.model.Reconstructor` reads the background.
     """
     batch = prepared.batch
+    views = batch.images, batch.masks, batch.c2w, batch.intrinsics
     if isinstance(model, LocalReconstructor):
-        views = batch.images, batch.masks, batch.c2w, batch.intrinsics
         detail = prepared.images, prepared.camera.intrinsics
         return model.encode_for_inference(*views, *detail, mirrored=prepared.mirrored)
     shown = torch.tensor([background], device=batch.images.device, dtype=torch.bool)
-    code = model.encode(
-        batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None], background_visible=shown
-    )
+    code = model.encode(*(v[None] for v in views), background_visible=shown)
     maps = ViewMaps(code.view_tokens[0].float(), prepared.images, prepared.camera)
     return TriplaneField(maps, model, code)
 
@@ -96,9 +94,8 @@ def extract(field: Field, resolution: int) -> Mesh:
     if isinstance(field, LocalField):
         mesh = largest_components(_bounded_surface(field, resolution), MIN_PART_FRACTION)
         mesh = taubin_smooth(mesh, iterations=field.model.preset.smoothing)  # predictions are noisy between cells
-        return _with_predicted_normals(field, replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)))
-    mesh = largest_components(_free_surface(field, resolution), MIN_PART_FRACTION)
-    return replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces))
+        return _with_predicted_normals(field, mesh.with_normals())
+    return largest_components(_free_surface(field, resolution), MIN_PART_FRACTION).with_normals()
 
 
 def _with_predicted_normals(field: LocalField, mesh: Mesh) -> Mesh:
@@ -135,8 +132,11 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
     near = bound < MARGIN_CELLS * cell
 
     def evaluate(index: Tensor) -> Tensor:
-        parts = [(_grid_points(axis, k), bound.view(-1)[k]) for k in index.split(CHUNK)]
-        return torch.cat([torch.maximum(field.sdf_within(*part), part[1]) for part in parts])
+        parts = []
+        for k in index.split(CHUNK):
+            points = torch.stack([axis[i] for i in torch.unravel_index(k, bound.shape)], 1)
+            parts.append(torch.maximum(field.sdf_within(points, bound.view(-1)[k]), bound.view(-1)[k]))
+        return torch.cat(parts)
 
     sdf = torch.maximum(sparse_sdf(bound.clamp(min=OUTSIDE_FIELD), near, evaluate), bound)
     sdf = cover_silhouettes(sdf, bound, maps.silhouette, maps.camera, radius=radius)
@@ -159,12 +159,6 @@ def _hull_reach(field: LocalField, resolution: int) -> float:
     if len(reach) == 0:
         raise InputError("masks", "expected masks that overlap in space, got none inside all of them; run reli3d check")
     return float(reach.max())
-
-
-def _grid_points(axis: Tensor, index: Tensor) -> Tensor:
-    """Points ``(N, 3)`` of the grid along ``axis (n,)`` with the flat indices ``index (N,)``."""
-    n = len(axis)
-    return torch.stack([axis[index // (n * n)], axis[index // n % n], axis[index % n]], 1)
 
 
 def texture(
@@ -208,20 +202,6 @@ def texture(
     chunk = CHUNK if mesh.vertices.is_cuda else TEXELS
     baked = bake(mesh, size, partial(in_rows, surface), chunk=chunk, tangents=True, values=known)
     return mesh, TextureSet(**{k: v.clamp_(0, 1) for k, v in baked.items()})
-
-
-def light(field: Field) -> Environment:
-    """The predicted environment, in the model frame."""
-    return Environment(field.radiance_map().contiguous())
-
-
-def match_brightness(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
-    """``asset`` with base color and lighting rescaled to match the colors of the views in ``maps``.
-
-    Images determine only the product of albedo and lighting; see :mod:`reli3d.render.exposure`.
-    """
-    maps = maps.inputs
-    return estimate_base_color_and_light(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, maps.camera, scene)
 
 
 @full_precision
@@ -270,11 +250,6 @@ class Stopwatch:
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
-
-
-def default_normalization(preset: Preset | LocalPreset) -> str:
-    """``none`` for presets with the published preprocessing, which uses poses as stored; otherwise ``auto``."""
-    return "none" if published_input(preset) else "auto"
 
 
 @dataclass(frozen=True)
@@ -334,11 +309,9 @@ def place(views: Views, preset: Preset | LocalPreset, options: ReconstructOption
 
     If poses are used as stored by default and the object does not fit the model's cube, the views get a note.
     """
-    normalization = options.normalization
-    if normalization is None:
-        normalization = default_normalization(preset)
-        if normalization == "none":
-            views = replace(views, notes=(*views.notes, *placement_notes(views)))
+    normalization = options.normalization or ("none" if published_input(preset) else "auto")
+    if options.normalization is None and normalization == "none":
+        views = replace(views, notes=(*views.notes, *placement_notes(views)))
     views = hero_first(views, options.hero)
     if options.hero and isinstance(preset, Preset):
         views = replace(views, notes=(*views.notes, f"reference view: {views.names[0]}"))
@@ -398,9 +371,11 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
         scene = RayScene(mesh.vertices, mesh.faces) if isinstance(field, LocalField) else None
         mesh, textures = texture(field, mesh, options.texture_size, scene, uv=options.uv)
     with watch.stage("light"):
-        asset = Asset(mesh, textures, light(field))
-        if scene is not None:
-            asset = match_brightness(asset, field.maps, scene)
+        asset = Asset(mesh, textures, Environment(field.radiance_map().contiguous()))
+        if scene is not None:  # images determine only the product of albedo and lighting
+            maps = field.maps.inputs
+            inside = maps.images[..., 3] > INSIDE
+            asset = estimate_base_color_and_light(asset, maps.images[..., :3], inside, maps.camera, scene)
     with watch.stage("frame"):
         near, output_from_model = asset.mesh, placed.output_from_input.compose(placed.model_from_input.inverse())
         asset = transform_asset(asset, output_from_model)

@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -268,10 +269,9 @@ def _without_moving(
     if epipolar_fit(first, masks) < RIGID_FIT:
         return segmented, scene
     regions = [_still_region(v, first.points[scene.support], masks.get(v.photo.name)) for v in first.views]
-    try:
+    second = None
+    with suppress(InputError):
         second = map_photos([v.photo for v in first.views], progress, regions)
-    except InputError:
-        second = None
     if second and len(second.views) >= KEPT_FRACTION * len(first.views) and epipolar_fit(second, masks) >= RIGID_FIT:
         again = find_scene(second)
         renewed = _masks(second, again, known, None, progress)
@@ -321,12 +321,9 @@ def _refined(
         return segmented, up, ground
     views, by_name = segmented.views, {v.photo.name: v for v in first.views}
     lenses = first if report.surroundings_fit >= RIGID_FIT else None
-    try:
+    second, groups, after = None, list[Group](), 1.0
+    with suppress(InputError):
         second = map_photos([v.photo for v in views], progress, [segmented.masks[v.photo.name] for v in views], lenses)
-    except InputError:
-        second = None
-    groups: list[Group] = []
-    after = 1.0
     if second:
         groups = rigid_groups(first, second)
         if not groups or len(groups[0].names) < KEPT_FRACTION * len(second.views):  # the maps differ: which is right?
@@ -496,12 +493,10 @@ def widest_gap(eyes: np.ndarray) -> float:
 def _check(report: CaptureReport) -> None:
     """Fill ``failed`` with a line for each check that fails."""
     registered = report.registered / report.images
+    error = report.reprojection_error
     checks = (
         (registered >= LEAST_REGISTERED, f"{100 * registered:.0f} % of the images registered, at least 80 % expected"),
-        (
-            report.reprojection_error < MOST_ERROR,
-            f"reprojection error {report.reprojection_error} px, below 1 expected",
-        ),
+        (error < MOST_ERROR, f"reprojection error {error} px, below 1 expected"),
         (
             report.epipolar_fit >= LEAST_FIT,
             f"{100 * report.epipolar_fit:.0f} % of the matches on the object fit the cameras, at least 80 % expected: "
@@ -537,27 +532,13 @@ def _write(output: Path, views, masks, frame: Frame, box: np.ndarray, report: Ca
             pose = _c2w(view)
             pose[:3, :3] = frame.turn @ pose[:3, :3]
             pose[:3, 3] = frame.apply(view.eye)
-            frames.append(
-                {
-                    "file_path": f"images/{name}.jpg",
-                    "mask_path": f"masks/{name}.png",
-                    "transform_matrix": pose.tolist(),
-                    "fl_x": view.focal,
-                    "fl_y": view.focal,
-                    "cx": float(view.principal[0]),
-                    "cy": float(view.principal[1]),
-                    "w": view.photo.size[0],
-                    "h": view.photo.size[1],
-                }
-            )
+            (cx, cy), (w, h) = view.principal.tolist(), view.photo.size
+            paths = {"file_path": f"images/{name}.jpg", "mask_path": f"masks/{name}.png"}
+            lens = {"fl_x": view.focal, "fl_y": view.focal, "cx": cx, "cy": cy, "w": w, "h": h}
+            frames.append({**paths, "transform_matrix": pose.tolist(), **lens})
             thumbnails.append((name, image, mask, replace(view, radial=0.0)))
-        content = {
-            "camera_model": "PINHOLE",
-            "lighting": report.lighting,
-            "unit": report.unit,
-            "object_box": box.tolist(),
-            "frames": frames,
-        }
+        facts = {"camera_model": "PINHOLE", "lighting": report.lighting, "unit": report.unit}
+        content = {**facts, "object_box": box.tolist(), "frames": frames}
         (work / "transforms.json").write_text(json.dumps(content, indent=1))
         (work / "capture.json").write_text(json.dumps(asdict(report), indent=1))
         eyes = np.stack([frame.apply(v.eye) for v in views])

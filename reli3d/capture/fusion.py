@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from reli3d.capture.mapping import Map, View, grown
 from reli3d.capture.masks import COARSE_SIDE, full_size, grabcut, reduced, refined
+from reli3d.capture.rigidity import Frame
 from reli3d.capture.scene import Scene
 
 SIDES = COARSE_SIDE, COARSE_SIDE, 720  # pixels along the longer side of the images; memory limits the last
@@ -57,14 +58,6 @@ class _Small:
         return pixels * self.scale, depth
 
 
-@dataclass(frozen=True)
-class _Axes:
-    """Two directions in the support plane and its normal, rows of ``axes``, about ``origin`` in it."""
-
-    origin: np.ndarray
-    axes: np.ndarray
-
-
 def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Masks by name of the views in ``masks``, which may lack parts of the object; unchanged without a support plane.
 
@@ -76,10 +69,10 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     """
     if scene.plane is None:
         return masks
-    axes = _Axes(scene.plane.foot(scene.center), scene.plane.axes)
+    axes = Frame(1.0, scene.plane.axes.T, scene.plane.foot(scene.center))  # from the plane's axes to the map
     views = [v for v in found.views if v.photo.name in masks]
     inside = [masks[v.photo.name] for v in views]
-    points = (found.points[scene.object] - axes.origin) @ axes.axes.T
+    points = axes.inverse(found.points[scene.object])
     box = np.stack([np.minimum(points.min(0), [np.inf, np.inf, 0]), points.max(0)])
     cover = inside
     for side, cells, growth in zip(SIDES, GRIDS, VOLUME_SIDE, strict=True):
@@ -95,7 +88,7 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
             return masks
         box = np.stack([occupied.min(0), occupied.max(0)])
         high = occupied[:, 2] > min(SHADOW_HEIGHT[0] * (box[1] - box[0]).max(), SHADOW_HEIGHT[1] * box[1, 2])
-        occupied = occupied @ axes.axes + axes.origin
+        occupied = axes.apply(occupied)
         cover = [_silhouette(s, occupied[high], cell) for s in smalls]
         inside = [_segmented(s, e, occupied, cell) for s, e in zip(smalls, evidence, strict=True)]
     photos = [(v.photo.name, v.photo.pixels) for v in views]
@@ -114,7 +107,7 @@ class _Texture:
 
 
 def _plane_texture(
-    smalls: Sequence[_Small], inside: Sequence[np.ndarray], cover: Sequence[np.ndarray], axes: _Axes, scene: Scene
+    smalls: Sequence[_Small], inside: Sequence[np.ndarray], cover: Sequence[np.ndarray], axes: Frame, scene: Scene
 ) -> _Texture:
     """Median over views, after one gain for each view and channel, of what they show outside ``cover``.
 
@@ -146,12 +139,12 @@ def _plane_texture(
 
 
 def _plane_samples(
-    smalls, hidden: Sequence[np.ndarray], axes: _Axes, u: np.ndarray, v: np.ndarray
+    smalls, hidden: Sequence[np.ndarray], axes: Frame, u: np.ndarray, v: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colors ``(V, len(v), len(u), 3)`` of points of the plane in each view, NaN where it does not show them or
     ``hidden`` is 2; and where it shows them and ``hidden`` is 0.
     """
-    grid = np.stack([*np.meshgrid(u, v)], -1).reshape(-1, 2) @ axes.axes[:2] + axes.origin
+    grid = axes.apply(np.stack([*np.meshgrid(u, v), np.zeros((len(v), len(u)))], -1).reshape(-1, 3))
     samples = np.zeros((len(smalls), len(v), len(u), 3), np.float32)
     outside = np.zeros(samples.shape[:3], bool)
     for k, (small, values) in enumerate(zip(smalls, hidden, strict=True)):
@@ -197,11 +190,11 @@ def _outside(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.maximum(np.maximum(colors - cv2.dilate(others, window), cv2.erode(others, window) - colors), 0.0)
 
 
-def _expected(texture: _Texture, axes: _Axes, small: _Small) -> _Expected:
+def _expected(texture: _Texture, axes: Frame, small: _Small) -> _Expected:
     h, w = small.image.shape[:2]
     y, x = (np.mgrid[:h, :w] + 0.5) / small.scale
-    rays = small.view.rays(np.stack([x, y], -1).reshape(-1, 2)) @ axes.axes.T
-    eye = axes.axes @ (small.view.eye - axes.origin)
+    rays = small.view.rays(np.stack([x, y], -1).reshape(-1, 2)) @ axes.turn
+    eye = axes.inverse(small.view.eye)
     along = -eye[2] / np.where(np.abs(rays[:, 2]) > 1e-9, rays[:, 2], 1e-9)
     hit = (eye[:2] + along[:, None] * rays[:, :2]) / texture.cell + len(texture.color) / 2 - 0.5
     hit[along <= 0] = -10
@@ -275,14 +268,14 @@ def shown_pixels(
     return x[shown], y[shown], shown
 
 
-def _occupied(smalls, evidence, axes: _Axes, box, points, cells: int, growth: float) -> tuple[np.ndarray, float]:
+def _occupied(smalls, evidence, axes: Frame, box, points, cells: int, growth: float) -> tuple[np.ndarray, float]:
     """Centers ``(N, 3)``, in ``axes``, of the occupied cells connected to ``points``, and their size."""
     middle, side = box.mean(0), growth * float((box[1] - box[0]).max())
     middle[2] = max(middle[2], side / 2 - 0.05 * side)  # hardly any of it below the plane
     cell = side / cells
     at = (np.arange(cells) + 0.5 - cells / 2) * cell
     grid = np.stack(np.meshgrid(at, at, at, indexing="ij"), -1) + middle
-    flat = grid.reshape(-1, 3) @ axes.axes + axes.origin
+    flat = axes.apply(grid.reshape(-1, 3))
     odds, seen = np.zeros(len(flat)), np.zeros(len(flat))
     open_cells = (grid[..., 2].ravel() > 0).nonzero()[0]
     for k, (small, e) in enumerate(zip(smalls, evidence, strict=True), 1):

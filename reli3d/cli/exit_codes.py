@@ -169,16 +169,13 @@ def extra(option: str) -> Iterator[None]:
         raise InputError(option, str(error)) from None
 
 
-def check_range(name: str, value: float | None, low: float, high: float) -> None:
-    """Raises InputError if the option ``--name`` is given and not within ``low`` and ``high``."""
-    if value is not None and not low <= value <= high:
-        raise InputError(f"--{name}", f"expected {low:g} to {high:g}, got {value}")
-
-
 def check_ranges(args: argparse.Namespace, **ranges: tuple[float, float]) -> None:
-    """:func:`check_range` of several options, each with its ``(low, high)``; missing attributes count as not given."""
+    """Raises InputError if an option, or a value of its list, is given and not within its ``(low, high)``."""
     for name, (low, high) in ranges.items():
-        check_range(name.replace("_", "-"), getattr(args, name, None), low, high)
+        given = getattr(args, name, None)
+        for value in given if isinstance(given, list | tuple) else [given]:
+            if value is not None and not low <= value <= high:
+                raise InputError(f"--{name.replace('_', '-')}", f"expected {low:g} to {high:g}, got {value}")
 
 
 def report(line: str) -> None:

@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from reli3d.cli.exit_codes import Parser, check_range, command, extra
+from reli3d.cli.exit_codes import Parser, check_ranges, command, extra
 from reli3d.errors import InputError
 
 FORMATS = ("glb", "obj", "usdz")
@@ -63,8 +63,7 @@ def main(argv: list[str] | None = None) -> int:
 def _check(args: argparse.Namespace) -> None:
     from reli3d.output.folder import check_folder
 
-    check_range("decimate", args.decimate, 16, 10**7)
-    check_range("texture-size", args.texture_size, 64, 4096)
+    check_ranges(args, decimate=(16, 10**7), texture_size=(64, 4096))
     if args.textures != "png" and args.format != "glb":
         raise InputError("--textures", f"expected png with --format {args.format}, got {args.textures}")
     check_folder(args.output)

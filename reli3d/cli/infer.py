@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from reli3d.cli import objects
-from reli3d.cli.exit_codes import check_range, check_ranges, command, report, show_traceback
+from reli3d.cli.exit_codes import check_ranges, command, report, show_traceback
 from reli3d.cli.help_format import joined
 from reli3d.cli.options import AXES, parser
 from reli3d.errors import InputError, printable
@@ -97,8 +97,7 @@ def refinement_budget(args: argparse.Namespace, device: str) -> dict[str, float 
         return {}
     if not args.refine:
         return {"seconds": REFINE_SECONDS[device]}
-    if steps := re.fullmatch(r"([0-9]{1,9}) ?steps", args.refine):
-        check_range("refine", int(steps[1]), 1, 1e9)
+    if steps := re.fullmatch(r"0*([1-9][0-9]{0,8}) ?steps", args.refine):
         return {"steps": int(steps[1])}
     try:
         seconds = float(args.refine)

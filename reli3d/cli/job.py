@@ -43,7 +43,7 @@ class FolderJob:
             args.texture_size, args.resolution, args.normalize, args.up, hero=args.hero, background=args.background
         )
         self.reading = FolderOptions(
-            args.views, args.masks, args.remove_background, budget, args.refine_cameras, interrupt_flag, args.light
+            args.views, args.masks, args.remove_background, budget, args.refine_cameras, interrupted.is_set, args.light
         )
         path = weights.locate(args.weights)
         trunk = args.precision if args.precision in (None, "auto") else getattr(torch, args.precision)
@@ -60,7 +60,7 @@ class FolderJob:
 
     def run(self, folder: Path, name: str, target: Path) -> str:
         """Reconstructs one object and writes its files; with --skip-existing only if they are missing."""
-        interrupt_flag.clear()
+        interrupted.clear()
         with claimed(target, results.OURS) as replacing:
             if self.skip and results.complete(target, folder, refined=bool(self.reading.budget)):
                 return "skipped"
@@ -99,7 +99,7 @@ class Bar(Progress):
     def __call__(self, stage: str) -> None:
         self.catching.close()
         if stage == "refine":
-            self.catching.enter_context(interrupt_flag.catching())
+            self.catching.enter_context(catching_interrupt())
         if not self.bar.disable:
             self.bar.set_postfix_str(stage, refresh=False)
             self.bar.n = STAGES.index(stage)
@@ -121,38 +121,26 @@ class Bar(Progress):
         self.bar.close()
 
 
-class InterruptFlag:
-    """Whether Ctrl-C was pressed inside :meth:`catching`; call it for the value."""
-
-    def __init__(self) -> None:
-        self._flag = False
-
-    def __call__(self) -> bool:
-        return self._flag
-
-    def clear(self) -> None:
-        self._flag = False
-
-    @contextlib.contextmanager
-    def catching(self) -> Iterator[None]:
-        """In the block the first Ctrl-C sets the flag; the second one has its usual effect."""
-        before = signal.getsignal(signal.SIGINT)
-        if threading.current_thread() is not threading.main_thread() or before == signal.SIG_IGN:
-            yield
-            return
-
-        def note(number: int, frame) -> None:
-            self._flag = True
-            signal.signal(signal.SIGINT, before)
-
-        signal.signal(signal.SIGINT, note)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, before)
+interrupted = threading.Event()
 
 
-interrupt_flag = InterruptFlag()
+@contextlib.contextmanager
+def catching_interrupt() -> Iterator[None]:
+    """In the block the first Ctrl-C sets :data:`interrupted`; the second one has its usual effect."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before == signal.SIG_IGN:
+        yield
+        return
+
+    def note(number: int, frame) -> None:
+        interrupted.set()
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def compile_kernels(device: str) -> None:

@@ -20,7 +20,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import Protocol
@@ -37,7 +37,6 @@ SUMMARY = "summary.csv"
 CRASHED = "its worker crashed twice; is there too little memory?"
 PATIENCE = 10.0  # seconds for a process to end before it is killed
 POLL = 0.2  # seconds: Python handles a signal that another thread received only after a blocking wait
-COLUMNS = ("object", "result", "seconds", "mask_iou", "faces", "retried", "notes")
 
 
 class Job(Protocol):
@@ -164,9 +163,8 @@ def listed(path: Path) -> list[Path]:
     folders = [Path(line.strip()) for line in lines if line.strip()]
     if not folders:
         raise InputError(path, "expected a folder on each line, got none; name the objects")
-    for folder in folders:
-        if "\0" in str(folder):
-            raise InputError(path, "expected a text file that names folders, got a zero byte; name a folder")
+    if any("\0" in str(folder) for folder in folders):
+        raise InputError(path, "expected a text file that names folders, got a zero byte; name a folder")
     return folders
 
 
@@ -333,7 +331,7 @@ def write_summary(path: Path, rows: Sequence[Row]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(COLUMNS)
+    table.writerow(field.name for field in fields(Row))
     for row in rows:
         values = ["" if v is None else v for v in (row.seconds, row.mask_iou, row.faces)]
         name, notes = printable(row.object), printable("; ".join(row.notes))

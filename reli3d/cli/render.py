@@ -14,7 +14,6 @@ from reli3d.errors import InputError
 FORMATS = ("png", "exr", "webp", "gif", "mp4")
 UNSUPPORTED = (".mov", ".avi", ".mkv", ".webm", ".m4v", ".apng", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".hdr")
 MOVING = ("webp", "gif", "mp4")  # one file of all frames
-STILL = ("png", "exr")  # one file a frame
 RATE = 24  # frames a second
 QUALITIES = {"draft": ((6, 12, 2), 1), "good": ((20, 40, 4), 2), "best": ((64, 128, 16), 4)}  # samples, supersampling
 
@@ -141,12 +140,12 @@ def _check(args: argparse.Namespace) -> None:
     from reli3d.output.folder import check_folder
 
     check_ranges(args, frames=(1, 3600), size=(1, 8192), supersampling=(1, 16), plan=(1, 65536), seed=(0, 10**9))
+    check_ranges(args, fov=(1, 150), elevation=(-89, 89), azimuth=(-3600, 3600), exposure=(-32, 32))
     if not all(0 <= k <= 65536 for k in args.samples) or sum(args.samples) == 0:
         raise InputError("--samples", f"expected three counts of 0 to 65536, one above 0, got {tuple(args.samples)}")
     if args.output.suffix.lower() in UNSUPPORTED and not args.output.is_dir():
-        raise InputError(
-            "--output", f"expected a folder or a file of type .png, .exr, .webp, .gif or .mp4, got {args.output}"
-        )
+        types = ", ".join(f".{kind}" for kind in FORMATS)
+        raise InputError("--output", f"expected a folder or a file of type {types}, got {args.output}")
     if args.format == "mp4":
         if args.size % 2:
             raise InputError("--size", f"expected an even number of pixels for mp4, got {args.size}")
@@ -154,11 +153,6 @@ def _check(args: argparse.Namespace) -> None:
 
         with extra("--format mp4"):
             video.library()  # before minutes of work
-    if not 1.0 <= args.fov <= 150.0:
-        raise InputError("--fov", f"expected 1 to 150 degrees, got {args.fov}")
-    for name, limit in (("elevation", 89.0), ("azimuth", 3600.0), ("exposure", 32.0)):
-        if not abs(getattr(args, name)) <= limit:
-            raise InputError(f"--{name}", f"expected {-limit:g} to {limit:g}, got {getattr(args, name)}")
     if args.distance is not None and not 0.0 < args.distance < math.inf:
         raise InputError("--distance", f"expected a positive length, got {args.distance}")
     choose_device(args.device)
@@ -214,17 +208,17 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         turned = environment if args.turn == "camera" else environment.rotated(turn)
         sampling: Any = {"options": replace(options, seed=args.seed + frame), "supersampling": args.supersampling}
         image = render_asset(parts, camera, turned, background=args.background, **sampling, **shown)
-        still = args.file if args.format in STILL else None
+        still = None if args.format in MOVING else args.file
         name = args.glb.stem if still is None else still.stem
         stem = args.output / (name if args.frames == 1 else f"{name}_{frame:04d}")
-        if args.format == "exr":
-            written.append(still or stem.with_name(stem.name + ".exr"))
-            write_exr(written[-1], (image.radiance * 2.0**args.exposure).cpu())
-        else:
+        if args.format in MOVING:
             animation.append(_display_image(image, args))
-            if args.format == "png":
-                written.append(still or stem.with_name(stem.name + ".png"))
-                _save(written[-1], animation.pop(), format="PNG")
+        else:
+            written.append(still or stem.with_name(f"{stem.name}.{args.format}"))
+            if args.format == "exr":
+                write_exr(written[-1], (image.radiance * 2.0**args.exposure).cpu())
+            else:
+                _save(written[-1], _display_image(image, args), format="PNG")
         if args.aovs:
             written += _write_aovs(stem, image)
         bar.update(1)

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from reli3d.cli.exit_codes import Parser, check_range, command, report
+from reli3d.cli.exit_codes import Parser, check_ranges, command, report
 from reli3d.errors import InputError
 
 MAX_VIEWS = 16  # input views
@@ -35,10 +35,7 @@ def main(argv: list[str] | None = None) -> int:
     from reli3d.render.environment import Environment
     from reli3d.synthetic.maps import held_out, load_maps
 
-    check_range("size", args.size, 16, 2048)
-    check_range("seed", args.seed, 0, 10**9)
-    for count in args.views:
-        check_range("views", count, 1, MAX_VIEWS)
+    check_ranges(args, size=(16, 2048), seed=(0, 10**9), views=(1, MAX_VIEWS))
     check_folder(args.output)
     for path in args.objects:
         file_size(path)

@@ -9,10 +9,9 @@ import torch
 import warp as wp
 
 from reli3d import kernels
-from tests.support import op_cases, op_cases_plain, reference
-from tests.support.op_cases import Case, N, rng
+from tests.support import reference
+from tests.support.op_cases import CASES, Case, N, rng
 
-CASES = {**op_cases.CASES, **op_cases_plain.CASES}
 DIFFERENTIABLE = [name for name, case in CASES.items() if case.grads]
 ROWS = 40  # rows where their number does not matter
 STEP = 3e-5  # of finite differences of derivatives: longer steps cross kinks of the mean absolute deviation

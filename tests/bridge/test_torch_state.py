@@ -19,10 +19,9 @@ from reli3d.render import allocation, color, lights, material, sampling, transfe
 from reli3d.render.environment import Environment
 from reli3d.render.image import render_asset
 from reli3d.render.shading import ShadeOptions
-from tests.support import op_cases, op_cases_plain
-from tests.support.op_cases import HOST, Case, numbers, units
+from tests.support import op_cases
+from tests.support.op_cases import CASES, HOST, Case, numbers, units
 
-CASES = {**op_cases.CASES, **op_cases_plain.CASES}
 ROWS = 40
 
 

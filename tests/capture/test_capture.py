@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from reli3d.capture.capture import capture
@@ -21,7 +22,7 @@ from tests.support.rigs import eyes_around, sphere_views
 
 @pytest.fixture(scope="module")
 def ground_truth():
-    return render_capture(views=20)
+    return render_capture(views=16, heights=(29, 39))
 
 
 @pytest.fixture(scope="module")
@@ -31,35 +32,39 @@ def captured(ground_truth, tmp_path_factory):
     return report, folder / "object"
 
 
-def similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation and shift that take the points ``a (N, 3)`` to ``b`` with the least squares (Umeyama 1991)."""
-    a0, b0 = a.mean(0), b.mean(0)
-    u, s, vt = np.linalg.svd((b - b0).T @ (a - a0))
-    sign = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
-    scale = float((s * np.diag(sign)).sum() / ((a - a0) ** 2).sum())
-    turn = u @ sign @ vt
-    return scale, turn, b0 - scale * turn @ a0
-
-
-def camera_errors(ground_truth, folder) -> tuple[float, float, float]:
-    """Largest position error over the distance, largest rotation error in degrees, relative focal length error."""
+def frames_of(folder) -> tuple[list[dict], list[int]]:
+    """Frames of a capture and the numbers of their photographs."""
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
-    index = [int(f["file_path"][7:10]) for f in frames]
+    return frames, [int(f["file_path"][7:10]) for f in frames]
+
+
+def similarity(ground_truth, folder, eyes: np.ndarray | None = None) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation and shift that take the true cameras to those of ``folder``, or to ``eyes``, by least squares."""
+    frames, index = frames_of(folder)
+    eyes = np.array([f["transform_matrix"] for f in frames])[:, :3, 3] if eyes is None else eyes
+    matrix, _, _ = trimesh.registration.procrustes(ground_truth.c2w[index, :3, 3], eyes, reflection=False)
+    scale = float(np.linalg.norm(matrix[:3, 0]))
+    return scale, matrix[:3, :3] / scale, matrix[:3, 3]
+
+
+def check_cameras(ground_truth, folder) -> None:
+    """Errors of positions over the distance, of rotations in degrees, and of the focal length."""
+    frames, index = frames_of(folder)
     got, expected = np.array([f["transform_matrix"] for f in frames]), ground_truth.c2w[index]
-    scale, turn, shift = similarity(got[:, :3, 3], expected[:, :3, 3])
-    away = np.linalg.norm(scale * got[:, :3, 3] @ turn.T + shift - expected[:, :3, 3], axis=1)
-    relative = turn @ got[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)
+    scale, turn, shift = similarity(ground_truth, folder)
+    away = np.linalg.norm(scale * expected[:, :3, 3] @ turn.T + shift - got[:, :3, 3], axis=1) / scale
+    relative = turn @ expected[:, :3, :3] @ got[:, :3, :3].transpose(0, 2, 1)
     angle = np.degrees(np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1)))
     distance = np.linalg.norm(expected[:, :3, 3], axis=1).mean()
-    return away.max() / distance, angle.max(), abs(frames[0]["fl_x"] / ground_truth.focal - 1)
+    assert away.max() / distance < 0.005 and angle.max() < 0.3
+    assert abs(frames[0]["fl_x"] / ground_truth.focal - 1) < 0.01
 
 
 def test_cameras_are_those_of_the_scene(ground_truth, captured):
     report, folder = captured
     assert report.registered == len(ground_truth.images) and not report.lost
-    position, angle, focal = camera_errors(ground_truth, folder)
-    assert position < 0.005 and angle < 0.3 and focal < 0.01
-    assert report.object_points > 480  # 559; 399 if each pair of images judges its matches by its own geometry
+    check_cameras(ground_truth, folder)
+    assert report.object_points > 400  # 456; 361 if each pair of images judges its matches by its own geometry
 
 
 def test_two_runs_write_equal_files(ground_truth, captured, tmp_path):
@@ -67,12 +72,13 @@ def test_two_runs_write_equal_files(ground_truth, captured, tmp_path):
     _, folder = captured
     capture(ground_truth.write(tmp_path / "photographs"), tmp_path / "object")
     files = [p.relative_to(folder) for p in sorted(folder.rglob("*")) if p.is_file()]
-    assert len(files) > 40
+    assert len(files) > 30
     assert all((folder / p).read_bytes() == (tmp_path / "object" / p).read_bytes() for p in files)
 
 
 @pytest.mark.slow
-def test_alpha_of_cut_out_photographs_is_used_as_masks(ground_truth, tmp_path):
+def test_alpha_of_cut_out_photographs_is_used_as_masks(tmp_path):
+    ground_truth = render_capture(views=20)
     photographs = tmp_path / "photographs"
     photographs.mkdir()
     for k, (image, mask) in enumerate(zip(ground_truth.images, ground_truth.masks, strict=True)):
@@ -92,8 +98,7 @@ def test_cameras_of_a_turntable(tmp_path):
     turning = render_capture(views=24, turntable=True)
     report = capture(turning.write(tmp_path / "photographs"), tmp_path / "object")
     assert report.registered == 24 and not report.failed and report.lighting == "camera"
-    position, angle, focal = camera_errors(turning, tmp_path / "object")
-    assert position < 0.005 and angle < 0.3 and focal < 0.01
+    check_cameras(turning, tmp_path / "object")
 
 
 @pytest.mark.slow
@@ -102,8 +107,7 @@ def test_cameras_of_an_object_that_is_moved_between_two_passes(tmp_path):
     moved = render_capture(views=40, moved_after=20)
     report = capture(moved.write(tmp_path / "photographs"), tmp_path / "object")
     assert report.registered == 40 and any("moved" in note for note in report.notes)
-    position, angle, focal = camera_errors(moved, tmp_path / "object")
-    assert position < 0.005 and angle < 0.3 and focal < 0.01
+    check_cameras(moved, tmp_path / "object")
 
 
 @pytest.mark.slow
@@ -112,8 +116,7 @@ def test_cameras_where_something_moves_behind_the_object(tmp_path):
     passed = render_capture(views=24, passerby=True)
     report = capture(passed.write(tmp_path / "photographs"), tmp_path / "object")
     assert report.registered == 24 and not report.failed and any("something moves" in note for note in report.notes)
-    position, angle, focal = camera_errors(passed, tmp_path / "object")
-    assert position < 0.005 and angle < 0.3 and focal < 0.01
+    check_cameras(passed, tmp_path / "object")
 
 
 def test_masks_are_those_of_the_scene_and_views_agree(ground_truth, captured):
@@ -128,11 +131,7 @@ def test_masks_are_those_of_the_scene_and_views_agree(ground_truth, captured):
 
 
 def test_the_frame_is_upright_with_the_ground_at_zero(ground_truth, captured):
-    _, folder = captured
-    frames = json.loads((folder / "transforms.json").read_text())["frames"]
-    index = [int(f["file_path"][7:10]) for f in frames]
-    got, expected = np.array([f["transform_matrix"] for f in frames])[:, :3, 3], ground_truth.c2w[index, :3, 3]
-    scale, turn, shift = similarity(expected, got)
+    scale, turn, _ = similarity(ground_truth, captured[1])
     assert (turn @ [0, 1, 0])[1] > np.cos(np.radians(1.0))
     assert abs(scale - 1.0) < 0.1  # the object's longest side is 1; a hull is larger than its object
 
@@ -140,12 +139,9 @@ def test_the_frame_is_upright_with_the_ground_at_zero(ground_truth, captured):
 def test_a_capture_is_placed_by_the_box_of_its_object(ground_truth, captured):
     """The network's frame has the object's center at the origin although the capture's has the ground there."""
     _, folder = captured
-    frames = json.loads((folder / "transforms.json").read_text())["frames"]
-    index = [int(f["file_path"][7:10]) for f in frames]
     views = load_views(folder, every=True)
-    placed = normalize(views)
-    got = placed.apply(views.c2w[:, :3, 3].double()).numpy()
-    scale, turn, shift = similarity(ground_truth.c2w[index, :3, 3], got)
+    got = normalize(views).apply(views.c2w[:, :3, 3].double()).numpy()
+    scale, turn, shift = similarity(ground_truth, folder, got)
     vertices = make_object(3).vertices
     center = (vertices.min(0) + vertices.max(0)) / 2
     assert np.abs(scale * turn @ center + shift).max() < 0.06  # a hull of views from above reaches beyond its object

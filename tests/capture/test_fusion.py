@@ -11,6 +11,7 @@ from reli3d.capture import fusion
 from reli3d.capture.fusion import fused_masks
 from reli3d.capture.mapping import Map, View
 from reli3d.capture.photos import Photo
+from reli3d.capture.rigidity import Frame
 from reli3d.capture.scene import Plane, Scene
 from tests.support.mapped import view
 
@@ -18,13 +19,19 @@ RADIUS, GRAY = 0.35, 90.0
 SHADOW = 50  # texels of 0.01
 
 
+def rays_of(camera: View) -> np.ndarray:
+    """Through the centers of its pixels, row by row."""
+    w, h = camera.photo.size
+    y, x = np.mgrid[:h, :w] + 0.5
+    return camera.rays(np.stack([x, y], -1).reshape(-1, 2))
+
+
 def pictured(k: int, eye: np.ndarray, texture: np.ndarray) -> tuple[View, np.ndarray, np.ndarray]:
     """A gray ball on a textured plane ``z = -RADIUS`` before a wall of the same gray, its mask, and the mask of its
     contact shadow, by ray casting."""
     camera = view(k, eye)
     w, h = camera.photo.size
-    y, x = np.mgrid[:h, :w] + 0.5
-    rays = camera.rays(np.stack([x, y], -1).reshape(-1, 2))
+    rays = rays_of(camera)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     along = rays @ eye
     ball = (along**2 - (eye @ eye - RADIUS**2) > 0) & (along < 0)
@@ -101,14 +108,13 @@ def test_texels_that_enough_views_show_outside_the_masks_have_the_colors_of_the_
     """Two low parts, missing in the cover: the first is in the masks of 6 of 10 views, the other in those of 7."""
     plane, part, radius, at = 100, 200, 0.15, ((-0.4, 0.0), (0.4, 0.0))
     scene = Scene(np.zeros(3), 2.4, Plane(np.array([0.0, 0, 1]), 0.0), np.zeros(0, bool), np.zeros(0, bool))
-    axes = fusion._Axes(np.zeros(3), scene.plane.axes)
+    axes = Frame(1.0, scene.plane.axes.T, np.zeros(3))
     smalls, inside, cover = [], [], []
     for k in range(10):
         azimuth = 2 * np.pi * k / 10
         camera = view(k, 2.4 * np.array([np.cos(azimuth), np.sin(azimuth), 1.0]) / np.sqrt(2))
         w, h = camera.photo.size
-        y, x = np.mgrid[:h, :w] + 0.5
-        rays = camera.rays(np.stack([x, y], -1).reshape(-1, 2))
+        rays = rays_of(camera)
         shown = (camera.eye - camera.eye[2] / rays[:, 2:] * rays)[:, :2]  # of the plane z = 0
         low = np.zeros(h * w, bool)
         for place, views in zip(at, (6, 7), strict=True):
@@ -118,7 +124,7 @@ def test_texels_that_enough_views_show_outside_the_masks_have_the_colors_of_the_
         inside.append(low.reshape(h, w))
         cover.append(np.zeros((h, w), bool))
     texture = fusion._plane_texture(smalls, inside, cover, axes, scene)
-    index = np.array([[*place, 0.0] for place in at]) @ axes.axes[:2].T / texture.cell + len(texture.color) / 2
+    index = np.array([[*place, 0.0] for place in at]) @ axes.turn[:, :2] / texture.cell + len(texture.color) / 2
     first, other = (texture.color[v, u] for u, v in index.astype(int))
     assert np.abs(first - plane).max() < 1  # 4 views show it outside the masks; the median of all shows the part
     assert np.abs(other - part).max() < 1  # only 3: all are taken

@@ -6,6 +6,8 @@ import re
 import struct
 import warnings
 from fractions import Fraction
+from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -29,6 +31,14 @@ def textured(seed: int, width: int = 320, height: int = 240) -> np.ndarray:
     rng = np.random.default_rng(seed)
     coarse = Image.fromarray(rng.integers(0, 255, (height // 4, width // 4, 3), dtype=np.uint8))
     return np.asarray(coarse.resize((width, height), Image.Resampling.NEAREST))
+
+
+def photographs(folder: Path, images, form: str = "png", **options) -> Path:
+    """``folder`` with ``0.png``, ``1.png`` ... of images or arrays."""
+    folder.mkdir(exist_ok=True)
+    for k, image in enumerate(images):
+        (image if isinstance(image, Image.Image) else Image.fromarray(image)).save(folder / f"{k}.{form}", **options)
+    return folder
 
 
 def test_focal_length_of_a_canon_comes_from_its_sensor():
@@ -55,7 +65,7 @@ def test_photographs_are_upright_reduced_and_in_order(tmp_path):
     exif = Image.Exif()
     exif[BASE.Orientation] = 6  # turn by 90 degrees clockwise to show
     for k in range(8):
-        Image.fromarray(textured(k, 2400, 1200)).save(tmp_path / f"{9 - k}.jpg", exif=exif)
+        Image.fromarray(textured(k, *((2400, 1200) if k == 7 else ()))).save(tmp_path / f"{9 - k}.jpg", exif=exif)
     photos, _ = read_photos(tmp_path, quiet)
     assert [p.name for p in photos] == [str(k) for k in range(2, 10)]
     assert photos[0].size == (1000, 2000)
@@ -78,47 +88,35 @@ def test_heic_photographs_are_upright(tmp_path):
 
 
 def test_masks_are_found_by_name_before_the_mapping(tmp_path):
-    photographs, masks = tmp_path / "photographs", tmp_path / "masks"
-    for folder in (photographs, masks):
-        folder.mkdir()
-    for k in range(8):
-        Image.fromarray(textured(k)).save(photographs / f"{k}.jpg")
-        Image.new("L", (100, 100)).save(masks / f"other{k}.png")
-    options = CaptureOptions(masks=masks)
-    with pytest.raises(InputError, match="masks with the names of the photographs.* at least 8 of 8, got 0"):
-        capture(photographs, tmp_path / "object", options)
-    Image.new("L", (100, 100)).save(masks / "0.jpg.png")  # as COLMAP names it
-    with pytest.raises(InputError, match=r"0\.jpg\.png.*aspect of 320 x 240"):
-        capture(photographs, tmp_path / "object", options)
-    Image.new("L", (320, 240)).save(masks / "0.png")
-    with pytest.raises(InputError, match=r"one mask of 0, got 0\.jpg\.png, 0\.png"):
-        capture(photographs, tmp_path / "object", options)
-    (masks / "0.jpg.png").unlink()
-    Image.fromarray(np.repeat([[0], [100], [200]], 3, 1).astype(np.uint8)).resize((320, 240), 0).save(masks / "0.png")
-    with pytest.raises(InputError, match=r"0\.png: .*labels"):
-        capture(photographs, tmp_path / "object", options)
-    for k in range(8):
-        Image.new("L", (320, 240)).save(masks / f"{k}.png")  # black: the object is in none of the images
-    with pytest.raises(InputError, match="at least 8 of 8, got 0"):
-        capture(photographs, tmp_path / "object", options)
+    source, masks = photographs(tmp_path / "photographs", map(textured, range(8)), "jpg"), tmp_path / "masks"
+    labels = Image.fromarray(np.uint8([[0], [100], [200]]).repeat(3, 1)).resize((320, 240), 0)
+    black = Image.new("L", (320, 240))  # the object is in none of the images
+    masks.mkdir()
+    for files, message in (
+        ({"other0.png": black}, "masks with the names of the photographs.* at least 8 of 8, got 0"),
+        ({"0.jpg.png": Image.new("L", (100, 100))}, r"0\.jpg\.png.*aspect of 320 x 240"),  # as COLMAP names it
+        ({"0.png": black}, r"one mask of 0, got 0\.jpg\.png, 0\.png"),
+        ({"0.png": labels, "0.jpg.png": None}, r"0\.png: .*labels"),
+        ({f"{k}.png": black for k in range(8)}, "at least 8 of 8, got 0"),
+    ):
+        for name, image in files.items():
+            image.save(masks / name) if image else (masks / name).unlink()
+        with pytest.raises(InputError, match=message):
+            capture(source, tmp_path / "object", CaptureOptions(masks=masks))
     assert not (tmp_path / "object").exists()
 
 
 def test_the_exif_orientation_of_masks_is_applied(tmp_path):
-    photographs, masks = tmp_path / "photographs", tmp_path / "masks"
-    for folder in (photographs, masks):
-        folder.mkdir()
-    exif = Image.Exif()
+    exif, black = Image.Exif(), 8 * [Image.new("L", (320, 240))]
     exif[BASE.Orientation] = 6
-    for k in range(8):
-        Image.fromarray(textured(k)).save(photographs / f"{k}.jpg", exif=exif)
-        Image.new("L", (320, 240)).save(masks / f"{k}.png")
-    with pytest.raises(InputError, match=r"0\.png: .*240 x 320, got 320 x 240; turn it .* EXIF orientation"):
-        capture(photographs, tmp_path / "object", CaptureOptions(masks=masks))
-    for k in range(8):
-        Image.new("L", (320, 240)).save(masks / f"{k}.png", exif=exif)
-    with pytest.raises(InputError, match="at least 8 of 8, got 0"):  # they fit, but are black
-        capture(photographs, tmp_path / "object", CaptureOptions(masks=masks))
+    source = photographs(tmp_path / "photographs", map(textured, range(8)), "jpg", exif=exif)
+    for options, message in (
+        ({}, r"0\.png: .*240 x 320, got 320 x 240; turn it .* EXIF orientation"),
+        ({"exif": exif}, "at least 8 of 8, got 0"),  # they fit, but are black
+    ):
+        masks = photographs(tmp_path / "masks", black, **options)
+        with pytest.raises(InputError, match=message):
+            capture(source, tmp_path / "object", CaptureOptions(masks=masks))
     exif[BASE.Orientation] = 3
     mask, notes = textured(0)[..., 0], []
     Image.fromarray(mask).save(tmp_path / "a.png", exif=exif)
@@ -127,8 +125,7 @@ def test_the_exif_orientation_of_masks_is_applied(tmp_path):
 
 def test_alpha_is_a_mask_where_all_photographs_have_it(tmp_path):
     pixels = np.dstack([textured(0), np.zeros((240, 320), np.uint8)])
-    for k in range(8):
-        Image.fromarray(pixels).save(tmp_path / f"{k}.png")
+    photographs(tmp_path, 8 * [pixels])
     with pytest.raises(InputError, match="alpha: expected .* for at least 8 of 8, got 0"):
         capture(tmp_path, tmp_path / "object")
     pixels[:, :100, 3] = 255
@@ -149,8 +146,7 @@ def test_names_are_unique_in_any_case_and_keep_their_dots(tmp_path):
 
 
 def test_large_photographs_are_read_without_a_warning(tmp_path, monkeypatch):
-    for k in range(8):
-        Image.fromarray(textured(k)).save(tmp_path / f"{k}.png")
+    photographs(tmp_path, map(textured, range(8)))
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 320 * 240 - 1)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -185,34 +181,29 @@ def test_flash_and_mixed_sizes_are_reported(tmp_path):
 
 def test_gray_photographs_of_16_bits_keep_their_contrast(tmp_path):
     gray = textured(0)[..., 0]
-    for k in range(8):
-        Image.fromarray(gray.astype(np.uint16) * 257).save(tmp_path / f"{k}.png")
-    photos, _ = read_photos(tmp_path, quiet)
+    photos, _ = read_photos(photographs(tmp_path, 8 * [gray.astype(np.uint16) * 257]), quiet)
     assert np.array_equal(photos[0].pixels, np.repeat(gray[..., None], 3, -1))
 
 
-class Sink:
-    """A target that cannot be rewound, such as a pipe: the file has no length."""
-
-    def __init__(self, path):
-        self.file = path.open("wb")
-
-    def write(self, data):
-        return self.file.write(data)
+def write_video(target, images, *, crf: int = 12, dst_colorspace: str | None = None, form: str | None = None, **tags):
+    """target: a path, or what has ``write``.  tags: of the codec."""
+    with av.open(target, "w", format=form, options={"movflags": "faststart"} if form is None else {}) as file:
+        stream = file.add_stream("libx264", rate=30, options={"crf": str(crf)})
+        (stream.width, stream.height), stream.pix_fmt = images[0].size, "yuv420p"
+        for name, value in tags.items():
+            setattr(stream.codec_context, name, value)
+        for image in images:
+            frame = av.VideoFrame.from_image(image)
+            file.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace=dst_colorspace)))
+        file.mux(stream.encode())
 
 
 def test_a_video_without_a_length_is_read_to_its_end_with_square_pixels(tmp_path):
     path = tmp_path / "stream.mkv"
-    sink = Sink(path)
-    with av.open(sink, "w", format="matroska") as file:
-        stream = file.add_stream("libx264", rate=30, options={"crf": "12"})
-        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
-        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
-        stream.codec_context.color_trc = 16  # PQ
-        for k in range(2 * FRAME_COUNT):
-            file.mux(stream.encode(av.VideoFrame.from_image(Image.fromarray(textured(k // 2)))))
-        file.mux(stream.encode())
-    sink.file.close()
+    images = [Image.fromarray(textured(k // 2)) for k in range(2 * FRAME_COUNT)]
+    with path.open("wb") as file:
+        sink = SimpleNamespace(write=file.write)  # cannot be rewound, as a pipe: the file has no length
+        write_video(sink, images, form="matroska", sample_aspect_ratio=Fraction(4, 3), color_trc=16)  # PQ
     photos, notes = read_photos(path, quiet)
     assert len(photos) == FRAME_COUNT and "60 sharp frames taken of 120" in notes[0]
     assert photos[0].size == (427, 240) and any("HDR" in note for note in notes)
@@ -222,18 +213,9 @@ def test_a_video_without_a_length_is_read_to_its_end_with_square_pixels(tmp_path
 
 @pytest.mark.parametrize("tagged", [False, True])
 def test_high_definition_video_without_a_color_space_is_bt_709(tmp_path, tagged):
-    path = tmp_path / "clip.mp4"
-    with av.open(str(path), "w") as file:
-        stream = file.add_stream("libx264", rate=30, options={"crf": "4"})
-        stream.width, stream.height, stream.pix_fmt = 1280, 720, "yuv420p"
-        if tagged:
-            stream.codec_context.colorspace = 1
-        image = Image.new("RGB", (1280, 720), (200, 40, 40))
-        for _ in range(FEWEST):
-            frame = av.VideoFrame.from_image(image)
-            file.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace="ITU709")))
-        file.mux(stream.encode())
-    photos, _ = read_photos(path, quiet)
+    images, tags = FEWEST * [Image.new("RGB", (1280, 720), (200, 40, 40))], {"colorspace": 1} if tagged else {}
+    write_video(str(tmp_path / "clip.mp4"), images, crf=4, dst_colorspace="ITU709", **tags)
+    photos, _ = read_photos(tmp_path / "clip.mp4", quiet)
     assert np.abs(photos[0].pixels[300, 300].astype(int) - (200, 40, 40)).max() <= 3
 
 
@@ -263,9 +245,8 @@ def matrix_profile(title: str, columns: tuple, exponent: float) -> bytes:
 def test_photographs_in_display_p3_are_converted(tmp_path):
     """sRGB (200, 30, 30) lies at (183, 51, 42) there; an exponent of 2.2 differs from sRGB's curve by up to 6."""
     profile = matrix_profile("Display P3", DISPLAY_P3, 2.2)
-    for k in range(8):
-        Image.new("RGB", (320, 240), (183, 51, 42)).save(tmp_path / f"{k}.png", icc_profile=profile)
-    photos, notes = read_photos(tmp_path, quiet)
+    images = 8 * [Image.new("RGB", (320, 240), (183, 51, 42))]
+    photos, notes = read_photos(photographs(tmp_path, images, icc_profile=profile), quiet)
     assert np.abs(photos[0].pixels[100, 100].astype(int) - (200, 30, 30)).max() <= 7
     assert any("converted from Display P3 to sRGB; 8 of 8" in note for note in notes)
     found = []
@@ -334,15 +315,9 @@ def test_adobe_rgb_is_known_by_exif_alone(tmp_path):
 def test_the_sharpest_frame_of_each_window_of_a_video_is_taken(tmp_path):
     """Every third frame is sharp, the others are blurred; there are three frames a window."""
     path = tmp_path / "clip.mp4"
-    with av.open(str(path), "w", options={"movflags": "faststart"}) as file:
-        stream = file.add_stream("libx264", rate=30, options={"crf": "12"})
-        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
-        for k in range(3 * FRAME_COUNT):
-            image = Image.fromarray(textured(k // 3))
-            if k % 3 != 1:
-                image = image.resize((20, 15), Image.Resampling.BOX).resize((320, 240))
-            file.mux(stream.encode(av.VideoFrame.from_image(image)))
-        file.mux(stream.encode())
+    sharp = [Image.fromarray(textured(k)) for k in range(FRAME_COUNT)]
+    blurred = [image.resize((20, 15), Image.Resampling.BOX).resize((320, 240)) for image in sharp]
+    write_video(str(path), [image for three in zip(blurred, sharp, blurred, strict=True) for image in three])
     photos, notes = read_photos(path, quiet)
     assert len(photos) == FRAME_COUNT
     assert min(sharpness(p.pixels) for p in photos) > 0.5 * sharpness(textured(0))  # blurred ones have a tenth
@@ -362,10 +337,7 @@ def test_inputs_that_are_no_capture_are_refused_in_one_line(tmp_path):
     (tmp_path / "notes.txt").write_text("no photograph")
     with pytest.raises(InputError, match="folder of photographs or a video"):
         read_photos(tmp_path / "notes.txt", quiet)
-    few = tmp_path / "few"
-    few.mkdir()
-    for k in range(3):
-        Image.fromarray(textured(k)).save(few / f"{k}.png")
+    few = photographs(tmp_path / "few", map(textured, range(3)))
     with pytest.raises(InputError, match="at least 8 photographs, got 3"):
         read_photos(few, quiet)
     (few / "3.jpg").write_bytes(b"\xff\xd8\xff\xe0 broken")

@@ -26,6 +26,21 @@ def turned(points: np.ndarray, degrees: float) -> np.ndarray:
     return points @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [0.2, 0.1, 0]
 
 
+def hull_mask(pixels: np.ndarray) -> np.ndarray:
+    mask = np.zeros(SIZE[::-1], np.uint8)
+    cv2.fillConvexPoly(mask, np.rint(cv2.convexHull(pixels.astype(np.float32))).astype(np.int32), 255)
+    return cv2.dilate(mask, np.ones((5, 5), np.uint8))
+
+
+def map_of(views, matches=(), points=()) -> Map:
+    points = np.reshape(points, (-1, 3))
+    return Map(tuple(views), points, np.zeros(len(points)), np.full(len(points), 3), tuple(matches))
+
+
+def all_pairs(pixels: list[np.ndarray]) -> list[tuple]:
+    return [(a, b, pixels[a], pixels[b]) for b in range(len(pixels)) for a in range(b)]
+
+
 def object_map(moved: bool) -> tuple[Map, dict[str, np.ndarray]]:
     """A map of an object that is moved after six of twelve views, or not, and of its surroundings; and its masks."""
     rng = np.random.default_rng(0)
@@ -34,13 +49,10 @@ def object_map(moved: bool) -> tuple[Map, dict[str, np.ndarray]]:
     pixels, masks = [], {}
     for k, v in enumerate(views):
         shown = v.project(turned(points, 30) if moved and k >= 6 else points)[0]
-        mask = np.zeros(SIZE[::-1], np.uint8)
-        cv2.fillConvexPoly(mask, np.rint(cv2.convexHull(shown.astype(np.float32))).astype(np.int32), 255)
-        masks[v.photo.name] = cv2.dilate(mask, np.ones((5, 5), np.uint8))
+        masks[v.photo.name] = hull_mask(shown)
         both = np.concatenate([shown, v.project(surroundings)[0]])
         pixels.append(both + rng.normal(0, 0.1, both.shape))
-    matches = tuple((a, b, pixels[a], pixels[b]) for b in range(12) for a in range(b))
-    return Map(tuple(views), np.zeros((0, 3)), np.zeros(0), np.zeros(0), matches), masks
+    return map_of(views, all_pairs(pixels)), masks
 
 
 @pytest.mark.parametrize("moved", [False, True])
@@ -56,8 +68,8 @@ def test_matches_on_a_moved_object_do_not_fit_the_cameras(moved):
 
 def test_wrong_matches_alone_are_no_motion():
     rng, masks = np.random.default_rng(0), {str(k): np.full(SIZE[::-1], 255, np.uint8) for k in range(3)}
-    matches = tuple((a, b, *rng.uniform(0, SIZE, (2, 40, 2))) for b in range(3) for a in range(b))
-    assert epipolar_fit(Map(tuple(ring(3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), matches), masks) == 1.0
+    matches = [(a, b, *rng.uniform(0, SIZE, (2, 40, 2))) for b in range(3) for a in range(b)]
+    assert epipolar_fit(map_of(ring(3), matches), masks) == 1.0
 
 
 @pytest.mark.parametrize("moved", [False, True])
@@ -90,12 +102,9 @@ def test_what_moves_around_the_object_is_left_out_of_a_second_map(monkeypatch):
     corner, shown, masks = rng.uniform(5, 85, (80, 2)), [], {}
     for v in views:
         still = v.project(points)[0]
-        mask = np.zeros(SIZE[::-1], np.uint8)
-        cv2.fillConvexPoly(mask, np.rint(cv2.convexHull(still[:40].astype(np.float32))).astype(np.int32), 255)
-        masks[v.photo.name] = cv2.dilate(mask, np.ones((5, 5), np.uint8))
+        masks[v.photo.name] = hull_mask(still[:40])
         shown.append(np.concatenate([still, corner]))
-    matches = [tuple((a, b, shown[a][:n], shown[b][:n]) for b in range(12) for a in range(b)) for n in (160, 80)]
-    first, second = (Map(tuple(views), points, np.zeros(80), np.full(80, 3), m) for m in matches)
+    first, second = (map_of(views, all_pairs([pixels[:n] for pixels in shown]), points) for n in (160, 80))
     on_object = np.arange(80) < 40
     scene = Scene(np.zeros(3), 3.0, None, on_object, ~on_object)
     regions: list[np.ndarray] = []
@@ -131,18 +140,15 @@ def test_groups_of_views_have_the_motions_of_the_object():
         turn, shift = turns[k >= 7], np.array(shifts[k >= 7])
         rotation = v.rotation @ turn.T
         second.append(replace(v, rotation=rotation, translation=-rotation @ (2.5 * turn @ v.eye + shift)))
-    empty = np.zeros((0, 3)), np.zeros(0), np.zeros(0)
-    groups = rigid_groups(Map(tuple(first), *empty), Map(tuple(second), *empty))
+    groups = rigid_groups(map_of(first), map_of(second))
     assert [len(g.names) for g in groups] == [7, 5]
     for group, turn, shift in zip(groups, turns, shifts, strict=True):
         assert group.scale == pytest.approx(2.5) and np.allclose(group.turn, turn) and np.allclose(group.shift, shift)
         for name in group.names:
-            pose = group.moved(first[int(name)])
-            assert np.allclose(pose.rotation, second[int(name)].rotation) and np.allclose(
-                pose.eye, second[int(name)].eye
-            )
+            pose, expected = group.moved(first[int(name)]), second[int(name)]
+            assert np.allclose(pose.rotation, expected.rotation) and np.allclose(pose.eye, expected.eye)
     noisy = [replace(v, translation=v.translation + rng.normal(0, 1.0, 3)) for v in second]
-    assert not [g for g in rigid_groups(Map(tuple(first), *empty), Map(tuple(noisy), *empty)) if len(g.names) > 4]
+    assert not [g for g in rigid_groups(map_of(first), map_of(noisy)) if len(g.names) > 4]
 
 
 def test_normalized_coordinates_undo_the_lens():

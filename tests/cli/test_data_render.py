@@ -1,5 +1,6 @@
 """``reli3d-data render`` in several processes and on Ray: who is killed loses nothing, and the bits are the same."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -39,32 +40,15 @@ def alone(maps, tmp_path_factory):
     return {p.name: p.read_bytes() for p in out.iterdir()}
 
 
-def children(of: int) -> list[int]:
-    """Processes below ``of``."""
-    parents = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text().rpartition(")")[2].split()
-        except OSError:  # it has ended
-            continue
-        parents[int(path.parent.name)] = int(fields[1])
-    found, last = [], {of}
-    while last:
-        last = {p for p, parent in parents.items() if parent in last}
-        found += last
-    return found
-
-
 def at_work(of: int) -> list[int]:
     """Processes below ``of`` that make samples."""
-    found = []
-    for pid in children(of):
-        try:
-            line = Path(f"/proc/{pid}/cmdline").read_bytes()
-        except OSError:
-            continue
-        if b"ray::_made" in line or b"spawn_main" in line:  # Ray writes a worker's task there
-            found.append(pid)
+    found: list[int] = []
+    with contextlib.suppress(OSError):  # it has ended
+        for path in Path(f"/proc/{of}/task").glob("*/children"):
+            for pid in map(int, path.read_text().split()):
+                line = Path(f"/proc/{pid}/cmdline").read_bytes()
+                found += [pid] * (b"ray::_made" in line or b"spawn_main" in line)  # Ray writes a worker's task there
+                found += at_work(pid)
     return found
 
 

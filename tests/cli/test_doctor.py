@@ -43,26 +43,15 @@ def test_report_names_versions_devices_cache_and_weights(assets):
     assert usable and not any(doctor.PROBLEM in value for value in rows.values())
 
 
-def test_command_reports_usable_on_stdout(assets, capsys):
-    assert doctor.main([]) == 0
-    assert capsys.readouterr().out.splitlines()[-1].endswith(" usable")
-
-
-def test_json_has_the_rows_by_name_and_the_verdict(assets, capsys):
-    assert doctor.main(["--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["usable"] is True and found["reli3d"].startswith(reli3d.__version__) and found["verdict"] == "usable"
-    (assets / "weights" / "small.safetensors").unlink()
-    assert doctor.main(["--json"]) == 1
-    found = json.loads(capsys.readouterr().out)
-    assert found["usable"] is False and found["weights, small"].startswith(doctor.PROBLEM)
-
-
-def test_missing_weights_are_a_problem(assets, capsys):
-    (assets / "weights" / "small.safetensors").unlink()
-    assert doctor.main([]) == 1
-    out = capsys.readouterr().out
-    assert out.count(doctor.PROBLEM) == 1 and out.splitlines()[-1].endswith("not usable: 1 problem")
+def test_missing_weights_are_a_problem_in_the_table_and_in_json(assets, capsys):
+    for usable, verdict in ((True, "usable"), (False, "not usable: 1 problem")):
+        assert doctor.main([]) == doctor.main(["--json"]) == (0 if usable else 1)
+        *table, line = capsys.readouterr().out.splitlines()
+        assert table[-1].split(maxsplit=1) == ["verdict", verdict] and str(table).count(doctor.PROBLEM) == (not usable)
+        found = json.loads(line)
+        assert found["usable"] is usable and found["verdict"] == verdict and len(found) == len(table) + 1
+        assert found["weights, small"].startswith(doctor.PROBLEM) is not usable
+        (assets / "weights" / "small.safetensors").unlink(missing_ok=True)
 
 
 def test_a_part_that_fails_is_reported_and_the_rest_continues(assets, monkeypatch):
@@ -98,9 +87,7 @@ def test_wrong_call_ends_with_two(arguments):
 
 
 def test_the_constraints_name_every_dependency_and_reference():
-    folder = ROOT
-    pins = re.findall(r"^([\w-]+)==", (folder / "constraints.txt").read_text(), re.MULTILINE)
-    text = (folder / "pyproject.toml").read_text()
-    extras = re.search(r"^test = \[(.*?)\]", text, re.MULTILINE).group(1)
+    pins = re.findall(r"^([\w-]+)==", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    extras = re.search(r"^test = \[(.*?)\]", (ROOT / "pyproject.toml").read_text(), re.MULTILINE).group(1)
     expected = (*dependencies(), *re.findall(r'"([\w-]+)', extras))
     assert {name.lower() for name in expected} <= {name.lower() for name in pins}

@@ -15,24 +15,24 @@ from reli3d.geometry.bake import bake, rasterize_texels
 from reli3d.geometry.mesh import vertex_normals
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import read_glb, write_glb
-from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.asset import Asset
 from reli3d.render.gbuffer import surface_points
 from tests.support.meshes import mesh_from
 from tests.support.scenes import textures
 
 
+def colored(shape, size, color) -> Asset:
+    """``shape`` with an atlas of ``size`` texels per side, whose base color is a function of the position."""
+    mesh = unwrap(mesh_from(shape), texture_size=size).with_tangents()
+    base_color = bake(mesh, size, lambda position, normal: color(position))["value"]
+    return Asset(mesh, replace(textures(size, "cpu"), base_color=base_color))
+
+
 @pytest.fixture(scope="module")
 def glb(tmp_path_factory):
-    """A ball of 1280 triangles whose base color is a function of the position, at 128 texels."""
-    mesh = unwrap(mesh_from(trimesh.creation.icosphere(3)), texture_size=128).with_tangents()
-
-    def at(position, normal, tangent):
-        flat = torch.tensor([0.5, 0.5, 1.0]).expand_as(position)
-        half = torch.full_like(position[:, :1], 0.5)
-        return {"base_color": 0.5 + 0.4 * position, "roughness": half, "metallic": half, "normal": flat}
-
+    """A ball of 1280 triangles."""
     path = tmp_path_factory.mktemp("export") / "mesh.glb"
-    write_glb(path, Asset(mesh, TextureSet(**bake(mesh, 128, at, tangents=True))))
+    write_glb(path, colored(trimesh.creation.icosphere(3), 128, lambda position: 0.5 + 0.4 * position))
     return path
 
 
@@ -85,8 +85,7 @@ def test_vertex_colors_are_baked_where_the_format_has_none_and_notes_are_printed
 
 
 def test_colors_without_textures_are_baked_at_a_useful_size(tmp_path, capsys):
-    mesh = mesh_from(trimesh.creation.icosphere(3))
-    mesh = replace(unwrap(mesh, texture_size=64).with_tangents(), colors=None)
+    mesh = unwrap(mesh_from(trimesh.creation.icosphere(3)), texture_size=64).with_tangents()
     colors = 0.5 + 0.5 * mesh.vertices.clamp(-1, 1)
     write_glb(tmp_path / "mesh.glb", Asset(replace(mesh, colors=colors), textures(4, "cpu", (1.0, 1.0, 1.0))))
     assert main([str(tmp_path / "mesh.glb"), "--format", "obj", "--output", str(tmp_path / "out"), "--json"]) == 0
@@ -133,17 +132,8 @@ def test_textures_are_transferred_within_a_fraction_of_the_size():
     """Two small squares, the upper one black, at 0.1 of the half side: the lower one keeps its color."""
     scale = 0.05
     square = trimesh.Trimesh([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], [[0, 2, 1], [0, 3, 2]], process=False)
-    upper = square.copy().apply_translation([0, 0.1, 0])
-    both = unwrap(mesh_from(trimesh.util.concatenate([square, upper]).apply_scale(scale)), texture_size=64)
-
-    def at(position, normal, tangent):
-        flat = torch.tensor([0.5, 0.5, 1.0]).expand_as(position)
-        half = torch.full_like(position[:, :1], 0.5)
-        color = (position[:, 1:2] < 0.05 * scale).float().expand(-1, 3)
-        return {"base_color": color, "roughness": half, "metallic": half, "normal": flat}
-
-    both = both.with_tangents()
-    source = Asset(both, TextureSet(**bake(both, 64, at, tangents=True)))
+    both = trimesh.util.concatenate([square, square.copy().apply_translation([0, 0.1, 0])]).apply_scale(scale)
+    source = colored(both, 64, lambda position: (position[:, 1:2] < 0.05 * scale).float().expand(-1, 3))
     lower = transfer_textures(mesh_from(square.copy().apply_scale(scale)), source, 64)
     uv = ((lower.mesh.uv[lower.mesh.faces.long()].mean(1)) * 64).long()  # centers of the faces
     assert bool((lower.textures.base_color[uv[:, 1], uv[:, 0]] > 0.9).all())
@@ -169,4 +159,3 @@ def test_a_missing_extra_is_one_line(glb, tmp_path, capsys, monkeypatch):
     message = "reli3d export: --format usdz: usd-core is not installed: pip install 'reli3d[usd]'\n"
     assert capsys.readouterr().err == message
     assert not (tmp_path / "out").exists()
-    assert np.isfinite(read_glb(glb)[0].mesh.vertices.numpy()).all()

@@ -154,29 +154,21 @@ def until_all_wait(process: subprocess.Popen, items: list[objects.Item]) -> None
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs signals")
-@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (None, 130)])
 def test_a_signal_ends_all_processes_and_leaves_whole_results(tmp_path, number, code):
+    """None: SIGINT that a thread other than the main one receives."""
     items = folders(tmp_path, ["one", "two", "wait", "wait", "five"])
-    process = command(tmp_path, *(i.folder for i in items), "--output", tmp_path / "out", "--workers", 2)
-    until_all_wait(process, items[2:4])
-    process.send_signal(number)
-    out, err = process.communicate(timeout=30)
+    options = *(i.folder for i in items), "--output", tmp_path / "out", "--workers", 2
+    process = command(tmp_path, *options, code="" if number else INTERRUPT)
+    if number:
+        until_all_wait(process, items[2:4])
+        process.send_signal(number)
+    out, err = process.communicate(timeout=30)  # the objects wait for a minute
     assert process.returncode == code and err.count("reli3d-infer: ") == 1 and "Traceback" not in err
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["object0", "object1", "summary.csv"]
     assert out.count("mesh.glb") == 2
     table = read_table(tmp_path / "out" / "summary.csv")
     assert [(r["object"], r["result"]) for r in table] == [("object0", "done"), ("object1", "done")]
-
-
-@pytest.mark.skipif(os.name == "nt", reason="needs signals")
-def test_a_signal_that_another_thread_receives_ends_the_command(tmp_path):
-    items = folders(tmp_path, ["one", "two", "wait", "wait", "five"])
-    process = command(
-        tmp_path, *(i.folder for i in items), "--output", tmp_path / "out", "--workers", 2, code=INTERRUPT
-    )
-    err = process.communicate(timeout=30)[1]  # the objects wait for a minute
-    assert process.returncode == 130 and err.count("reli3d-infer: ") == 1 and "Traceback" not in err
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["object0", "object1", "summary.csv"]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
@@ -213,8 +205,9 @@ def test_names_are_different_and_quick_for_many(tmp_path):
 
 
 def test_a_list_names_folders(tmp_path):
-    (tmp_path / "list.txt").write_text("one\n\n  two/three  \nmit größe\n")
-    assert objects.listed(tmp_path / "list.txt") == [Path("one"), Path("two/three"), Path("mit größe")]
+    names = ["one", "two/three", "mit größe", "a\u2028b", "c\x85d", "e\x0cf"]  # str.splitlines splits the last three
+    (tmp_path / "list.txt").write_bytes("\r\n".join(["", *names, "", "  i \nj\r"]).encode())
+    assert objects.listed(tmp_path / "list.txt") == [*map(Path, names), Path("i"), Path("j")]
     (tmp_path / "bom.txt").write_bytes(b"\xef\xbb\xbfone\r\ntwo\r\n")
     assert objects.listed(tmp_path / "bom.txt") == [Path("one"), Path("two")]
     found = objects.items_of([Path("zero"), tmp_path / "bom.txt"], tmp_path)
@@ -236,31 +229,11 @@ def test_objects_that_are_all_refused_have_a_summary(tmp_path, capsys, monkeypat
     assert capsys.readouterr().err.count("word: expected another") == 2
 
 
-@pytest.mark.parametrize(
-    "options, word",
-    [
-        (["--workers", "0"], "--workers"),
-        (["--workers", "2", "--ray", "auto"], "--ray"),
-    ],
-)
-def test_wrong_options_end_with_2_before_the_work(tmp_path, capsys, monkeypatch, options, word):
-    monkeypatch.setattr(job, "FolderJob", None)  # a call raises TypeError
-    assert infer.main([*options, "--output", str(tmp_path / "out")]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1 and word in err and not (tmp_path / "out").exists()
-
-
 def test_a_folder_instead_of_the_summary_is_reported_at_once(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(job, "FolderJob", None)
     (tmp_path / "summary.csv").mkdir()
     assert infer.main(["a", "b", "--output", str(tmp_path)]) == 2
     assert "expected a file or none" in capsys.readouterr().err
-
-
-def test_ray_that_is_missing_is_reported(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)  # its import raises
-    with pytest.raises(ValueError, match=r"pip install reli3d\[ray\]"):
-        objects.on_ray(WordJob, [], "auto")
 
 
 @pytest.mark.slow
@@ -290,10 +263,3 @@ def test_results_are_bitwise_identical_wherever_an_object_is_made(tmp_path, opti
     info = json.loads((tmp_path / "out/third/run_info.json").read_text())
     assert [r["object"] for r in table] == ["first", "second", "third"]
     assert float(table[2]["mask_iou"]) == info["mask_iou"] > 0.8 and int(table[2]["faces"]) == info["mesh"]["faces"]
-
-
-def test_only_line_ends_separate_the_folders_of_a_list(tmp_path):
-    """U+2028, U+0085 and the form feed, at which ``str.splitlines`` splits, are legal in names."""
-    names = ["a\u2028b", "c\x85d", "e\x0cf", "g h"]
-    (tmp_path / "list.txt").write_bytes("\r\n".join([*names, "", "i\nj\r"]).encode())
-    assert [i.name for i in objects.items_of([tmp_path / "list.txt"], tmp_path)] == [*names, "i", "j"]

@@ -169,16 +169,8 @@ def test_diffuse_model_and_a_missing_light(scene, capsys):
 
 
 def test_planned_sample_counts_are_reported(scene, capsys):
-    common = [
-        str(scene / "ball.glb"),
-        "--output",
-        str(scene / "planned"),
-        "--size",
-        "16",
-        "--light",
-        str(scene / "half.hdr"),
-    ]
-    assert main([*common, "--plan", "16", "--json"]) == 0
+    common = [str(scene / "ball.glb"), "--output", str(scene / "planned"), "--light", str(scene / "half.hdr")]
+    assert main([*common, "--size", "16", "--plan", "16", "--json"]) == 0
     assert sum(json.loads(capsys.readouterr().out)["samples"]) <= 16
     assert main([*common, "--plan", "16", "--distance", "1e6"]) == 2
     assert "--plan: camera: expected the asset in view" in capsys.readouterr().err

@@ -18,7 +18,7 @@ from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.published import our_key
 from reli3d.nn.weights import load_model, save
 from reli3d.output import results
-from reli3d.pipeline import NoSurface, ReconstructOptions, default_normalization, prepare, reconstruct
+from reli3d.pipeline import NoSurface, ReconstructOptions, place, prepare, reconstruct
 from reli3d.views.folder import load_views
 from reli3d.views.published_views import published_views
 from reli3d.views.similarity import Similarity
@@ -99,7 +99,10 @@ def test_the_release_s_preparation_is_a_switch_of_the_preset(tiny):
     own = prepare(Reconstructor(NANO), EXAMPLE, Similarity.identity()).batch
     cropped = EXAMPLE.resampled(NANO.image_size, crop=True)
     assert torch.equal(own.images, cropped.images) and torch.equal(own.intrinsics, cropped.intrinsics)
-    assert default_normalization(TINY) == "none" and default_normalization(NANO) == "auto"
+    double = {"dtype": torch.float64}
+    away = EXAMPLE.transformed(Similarity(1.0, torch.eye(3, **double), torch.tensor([3.0, 0.0, 0.0], **double)))
+    assert place(away, TINY).model_from_input.is_identity()
+    assert float(place(away, NANO).model_from_input.translation.norm()) > 2.0
 
 
 def test_reference_view_and_background_reach_the_network(tiny, monkeypatch):

@@ -71,12 +71,8 @@ def violations(source: str, module: str, is_package: bool = False) -> list[str]:
             bad.append(f"{module} imports warp; what launches kernels is a public operation of its own")
         if top in ("tests", "bench"):
             bad.append(f"{module} imports {target}, which is not shipped")
-        if (
-            top == "reli3d"
-            and part
-            and part_of(target) not in ("", part)
-            and POSITION[part_of(target)] >= POSITION[part]
-        ):
+        other = part_of(target) if top == "reli3d" and part else ""
+        if other not in ("", part) and POSITION[other] >= POSITION[part]:
             bad.append(f"{module} imports {target}, which does not lie below it")
     return bad
 
@@ -92,33 +88,20 @@ def test_imports_point_down(path):
 PRESETS = (presets.OFFICIAL, presets.TINY, presets.SMALL)
 
 
-def fields_of(value) -> dict[str, set]:
-    """Values of all fields of a preset by name, those of nested dataclasses included."""
-    found: dict[str, set] = {}
-    for field in dataclasses.fields(value):
-        inner = getattr(value, field.name)
-        nested = fields_of(inner) if dataclasses.is_dataclass(inner) else {field.name: {inner}}
-        for name, values in nested.items():
-            found[name] = found.get(name, set()) | values
-    return found
+def leaves(fields: dict) -> list[tuple]:
+    """Names and values of all fields, those of nested ones included."""
+    return [pair for k, v in fields.items() for pair in (leaves(v) if isinstance(v, dict) else [(k, v)])]
 
 
 def constants_of_presets(source: str) -> list[str]:
     """Constants in ``source`` that repeat a preset: the name of one of its fields, or the half side of its cubes."""
-    fields = [fields_of(preset) for preset in PRESETS]
-    names = {name.upper() for found in fields for name in found}
-    radii = {radius for found in fields for radius in found["radius"]}
-    tree, bad = ast.parse(source), []
-    for node in tree.body:
-        targets = (
-            node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
-        )
-        inner = [part for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)]
-        bad += [part.id for part in inner if part.id in names]
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, float) and node.value in radii:
-            bad.append(str(node.value))
-    return bad
+    fields = [pair for preset in PRESETS for pair in leaves(dataclasses.asdict(preset))]
+    names, radii = {name.upper() for name, _ in fields}, {value for name, value in fields if name == "radius"}
+    tree = ast.parse(source)
+    assigned = [part for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign) for part in ast.walk(node)]
+    bad = [n.id for n in assigned if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store) and n.id in names]
+    numbers = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)]
+    return bad + [str(v) for v in numbers if isinstance(v, float) and v in radii]
 
 
 def test_kernels_geometry_and_render_contain_no_constant_of_a_preset():

@@ -93,11 +93,12 @@ def render_capture(
     views: int = 20,
     size: tuple[int, int] = (400, 300),
     *,
+    heights: tuple[float, float] = (24, 46),
     moved_after: int | None = None,
     turntable: bool = False,
     passerby: bool = False,
 ) -> TrueCapture:
-    """A ring of hand-held views at two heights under a sky; cameras are relative to the object.
+    """A ring of hand-held views at two heights [degrees] under a sky; cameras are relative to the object.
 
     moved_after: from this view on the object is elsewhere on the table.  turntable: the camera is fixed, the object
     turns with a small table in front of a textured background.  passerby: something upright moves behind the table.
@@ -107,7 +108,7 @@ def render_capture(
     focal = 1.4 * width
     steps = np.arange(views)
     azimuth = 2 * np.pi * (steps + (0 if turntable else 1) * rng.uniform(-0.2, 0.2, views)) / views
-    elevation = np.radians(np.where(steps % 2 == 0, 24, 46) + rng.uniform(-3, 3, views))
+    elevation = np.radians(np.where(steps % 2 == 0, *heights) + rng.uniform(-3, 3, views))
     distance = 2.9 * rng.uniform(0.92, 1.08, views)
     target, roll = rng.normal(0, 0.03, (views, 3)), rng.normal(0, 0.04, (views, 3))
     if turntable:

@@ -37,29 +37,42 @@ def good(folder: Path, views: int = 3) -> dict:
     frames = []
     for i in range(views):
         Image.fromarray(random_image()).save(folder / f"rgba/{i}.png")
-        frames.append(
-            {
-                "view_index": i,
-                "file_path": f"rgba/{i}.png",
-                "transform_matrix": pose(2.1 * i),
-                "camera_fov": [0.6, 0.6],
-                "camera_principal_point": [SIDE / 2, SIDE / 2],
-            }
-        )
+        lens = {"camera_fov": [0.6, 0.6], "camera_principal_point": [SIDE / 2, SIDE / 2]}
+        frames.append({"view_index": i, "file_path": f"rgba/{i}.png", "transform_matrix": pose(2.1 * i), **lens})
     data = {"object_uid": "disk", "coordinate_system": "ogl", "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(data))
     return data
 
 
+def _with(change: Callable[[Path], object]) -> Callable[[Path], None]:
+    """A good folder, changed."""
+
+    def make(folder: Path) -> None:
+        good(folder)
+        change(folder)
+
+    return make
+
+
+def _text(change: Callable[[str], str | bytes]) -> Callable[[Path], None]:
+    """A good folder with the text of its camera file changed."""
+
+    def edit(folder: Path) -> None:
+        text = change((folder / "transforms.json").read_text())
+        (folder / "transforms.json").write_bytes(text.encode() if isinstance(text, str) else text)
+
+    return _with(edit)
+
+
 def _json(change: Callable[[dict], object]) -> Callable[[Path], None]:
     """A good folder whose transforms are changed in place, or replaced by what ``change`` returns."""
 
-    def make(folder: Path) -> None:
-        data = good(folder)
+    def edit(text: str) -> str:
+        data = json.loads(text)
         result = change(data)
-        (folder / "transforms.json").write_text(json.dumps(data if result is None else result))
+        return json.dumps(data if result is None else result)
 
-    return make
+    return _text(edit)
 
 
 def _frame(**fields) -> Callable[[Path], None]:
@@ -85,25 +98,9 @@ def _set(row: int, column: int, value: object) -> Callable[[Path], None]:
     return _matrix(lambda m: m[row].__setitem__(column, value))
 
 
-def _text(change: Callable[[str], str | bytes]) -> Callable[[Path], None]:
-    """A good folder with the text of its camera file changed."""
-
-    def make(folder: Path) -> None:
-        good(folder)
-        text = change((folder / "transforms.json").read_text())
-        (folder / "transforms.json").write_bytes(text.encode() if isinstance(text, str) else text)
-
-    return make
-
-
 def _image(data: bytes | Callable[[], bytes]) -> Callable[[Path], None]:
     """A good folder whose first image has this content."""
-
-    def make(folder: Path) -> None:
-        good(folder)
-        (folder / "rgba/0.png").write_bytes(data if isinstance(data, bytes) else data())
-
-    return make
+    return _with(lambda folder: (folder / "rgba/0.png").write_bytes(data if isinstance(data, bytes) else data()))
 
 
 def _saved(pixels: np.ndarray, form: str = "PNG", **options) -> bytes:
@@ -130,23 +127,9 @@ def _animated() -> bytes:
     return buffer.getvalue()
 
 
-def _link(target: str) -> Callable[[Path], None]:
-    """A good folder whose first image is a link."""
-
-    def make(folder: Path) -> None:
-        good(folder)
-        (folder / "rgba/0.png").unlink()
-        (folder / "rgba/0.png").symlink_to(target)
-
-    return make
-
-
-def _with(make_more: Callable[[Path], object]) -> Callable[[Path], None]:
-    def make(folder: Path) -> None:
-        good(folder)
-        make_more(folder)
-
-    return make
+def _link(target: str, name: str = "rgba/0.png") -> Callable[[Path], None]:
+    """A good folder with a link in place of a file."""
+    return _with(lambda folder: ((folder / name).unlink(), (folder / name).symlink_to(target)))
 
 
 def _mask(pixels: np.ndarray | bytes | None) -> Callable[[Path], None]:
@@ -215,14 +198,8 @@ def cases() -> list[tuple[str, Callable[[Path], None]]]:
         ("missing_folder", lambda f: None),
         ("transforms_is_folder", lambda f: (f / "transforms.json").mkdir(parents=True)),
         ("transforms_is_pipe", lambda f: (f.mkdir(), os.mkfifo(f / "transforms.json"))),
-        (
-            "transforms_links_outside",
-            _with(lambda f: ((f / "transforms.json").unlink(), (f / "transforms.json").symlink_to("/etc/passwd"))),
-        ),
-        (
-            "transforms_dangling_link",
-            _with(lambda f: ((f / "transforms.json").unlink(), (f / "transforms.json").symlink_to("nowhere.json"))),
-        ),
+        ("transforms_links_outside", _link("/etc/passwd", "transforms.json")),
+        ("transforms_dangling_link", _link("nowhere.json", "transforms.json")),
         # the text of the camera file
         ("json_empty", _text(lambda t: "")),
         ("json_truncated", _text(lambda t: t[: len(t) // 2])),

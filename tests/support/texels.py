@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from scipy.ndimage import map_coordinates
 
 
 def color(p):
@@ -10,15 +11,7 @@ def color(p):
 
 
 def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Lookup as glTF defines it, float64, clamped to the edge; written for the tests."""
-    size = image.shape[0]
-    at = uv.astype(np.float64) * size - 0.5
-    low = np.floor(at).astype(int)
-    f = at - low
-    result = 0.0
-    for dx in (0, 1):
-        for dy in (0, 1):
-            x, y = np.clip(low[:, 0] + dx, 0, size - 1), np.clip(low[:, 1] + dy, 0, size - 1)
-            weight = np.where(dx, f[:, 0], 1 - f[:, 0]) * np.where(dy, f[:, 1], 1 - f[:, 1])
-            result = result + weight[:, None] * image[y, x].reshape(len(uv), -1)
-    return result
+    """Lookup ``(N, C)`` as glTF defines it, float64, clamped to the edge."""
+    at = (uv.astype(np.float64) * len(image) - 0.5).T[::-1]
+    channels = np.moveaxis(image.reshape(*image.shape[:2], -1).astype(np.float64), -1, 0)
+    return np.stack([map_coordinates(channel, at, order=1, mode="nearest") for channel in channels], -1)
