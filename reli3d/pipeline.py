@@ -79,7 +79,7 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False) -> F
     if isinstance(model, LocalReconstructor):
         views = batch.images, batch.masks, batch.c2w, batch.intrinsics
         detail = prepared.images, prepared.camera.intrinsics
-        return model.encode_for_inference(*views, *detail, mirrored=prepared.mirrored)
+        return model.encode(*views, *detail, mirrored=prepared.mirrored, inference=True)
     shown = torch.tensor([background], device=batch.images.device, dtype=torch.bool)
     code = model.encode(
         batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None], background_visible=shown
