@@ -39,7 +39,7 @@ class _VnInvariant(nn.Module):
     def __init__(self):
         super().__init__()
         # torch.eye on the meta device, on which weights.load builds, imports torch's compiler (2 seconds)
-        relu = {name: torch.zeros(2, 2).fill_diagonal_(1.0) for name in ("W", "U")}
+        relu = [(name, torch.zeros(2, 2).fill_diagonal_(1.0)) for name in ("W", "U")]  # of a dict the names were sorted
         self.mlp = nn.ModuleList([nn.ParameterDict({"weight": torch.ones(2, 1)}), nn.ParameterDict(relu)])
 
     def forward(self, p: Tensor) -> Tensor:
