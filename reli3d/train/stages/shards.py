@@ -15,8 +15,8 @@ from reli3d.io.files import replacing
 from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.views import Chooser, ObjectViews, Samples, Source, sample_views
 
-STORED_TENSORS = ("images", "c2w", "intrinsics", "view_material", "view_normal", "view_depth")
-STORED_TENSORS += ("environment", "finish_known")
+OF_VIEWS = ("images", "c2w", "intrinsics", "view_material", "view_normal", "view_depth")
+STORED_TENSORS = (*OF_VIEWS, "environment", "finish_known")
 
 
 def to_tensors(views: ObjectViews) -> dict[str, Tensor]:
