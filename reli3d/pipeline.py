@@ -79,7 +79,7 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False) -> F
     views = batch.images, batch.masks, batch.c2w, batch.intrinsics
     if isinstance(model, LocalReconstructor):
         detail = prepared.images, prepared.camera.intrinsics
-        return model.encode_for_inference(*views, *detail, mirrored=prepared.mirrored)
+        return model.encode(*views, *detail, mirrored=prepared.mirrored, inference=True)
     shown = torch.tensor([background], device=batch.images.device, dtype=torch.bool)
     code = model.encode(*(v[None] for v in views), background_visible=shown)
     maps = ViewMaps(code.view_tokens[0].float(), prepared.images, prepared.camera)

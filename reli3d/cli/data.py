@@ -165,12 +165,11 @@ def pack(args: argparse.Namespace) -> int:
     from reli3d.output.folder import check_folder
     from reli3d.train.stages import shards
     from reli3d.train.stages.captures import Captures
-    from reli3d.train.stages.sources import source
     from reli3d.train.stages.views import Samples
 
     check_ranges(args, each=(1, 10**6))
     check_folder(args.output)
-    found = source(args.input)
+    found = shards.source(args.input)
     if not isinstance(found, Samples | Captures):
         raise InputError(args.input, "expected samples or captures, got tar files")
     if isinstance(found, Captures):

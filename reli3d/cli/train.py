@@ -192,7 +192,7 @@ def paper_stage(args: argparse.Namespace) -> "Stage":
     from reli3d.nn.presets import OFFICIAL, TINY
     from reli3d.train.stages import config
     from reli3d.train.stages.latents import fitted, load_prior
-    from reli3d.train.stages.sources import source
+    from reli3d.train.stages.shards import source
     from reli3d.train.stages.stage import PaperOptions, PaperStage
     from reli3d.train.stages.views import Samples
 

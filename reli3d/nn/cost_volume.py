@@ -11,6 +11,7 @@ from torch.nn import functional
 from reli3d.geometry.camera import Camera, image_plane
 from reli3d.geometry.projection import gather_views
 from reli3d.nn.pyramid import MIN_COVERAGE, depth_of_origin
+from reli3d.nn.view_features import FAR_DISTANCE, NEAR_DISTANCE
 
 STEPS = (0.006, 0.012, 0.024, 0.048, 0.096, 0.16)  # world units, about log-uniform as the errors have long tails
 OFFSETS = (*(-s for s in reversed(STEPS)), 0.0, *STEPS)  # of the hypotheses from the predicted depth
@@ -19,7 +20,6 @@ CHANNELS, GROUPS = 16, 4  # compared features of a pixel, and groups that each g
 NEIGHBORS = 5  # views that a pixel is compared with, those of the closest directions
 PAIR_WIDTH, POOLED_WIDTH, CONV_WIDTH = 16, 8, 8  # widths of the layers on pairs, of their mean, of the 3D convolutions
 PAIR_FEATURES, OWN_FEATURES = 5, 5  # of a hypothesis in another view, and in its own
-NEAR_DISTANCE, FAR_DISTANCE = 0.05, 0.2  # scales of distances along a ray, world units
 MIN_SPREAD = 1e-3  # standard deviation where one hypothesis is certain, so that its gradient is finite
 
 

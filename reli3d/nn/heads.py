@@ -4,13 +4,11 @@ Sizes are the published ones; :mod:`reli3d.nn.published` maps the published name
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from reli3d.geometry.surface import CubeWeights
-from reli3d.geometry.triplane import sample_triplane
 
 ROUGHNESS_MIN = 0.1  # range [0.1, 1] of the published head
 NORMALIZE_EPS = 1.0e-7
@@ -20,23 +18,16 @@ MERGED_MULTIPLIER = 0.1  # on the merging MLP's output: initial weights are near
 DEFORMATION_LIMIT = 1.0 - 1.0e-8  # of half a cell, so that grid vertices never coincide
 
 
-@dataclass(frozen=True)
-class Head:
-    outputs: int
-    hidden: int  # hidden layers
-
-
-HEADS = {
-    "density": Head(1, 2),
-    "base_color": Head(3, 3),
-    "normal": Head(3, 3),
-    "deformation": Head(3, 2),
-    "roughness": Head(1, 2),
-    "metallic": Head(1, 2),
-    "flexicubes": Head(16, 1),
+HEADS = {  # outputs, hidden layers
+    "density": (1, 2),
+    "base_color": (3, 3),
+    "normal": (3, 3),
+    "deformation": (3, 2),
+    "roughness": (1, 2),
+    "metallic": (1, 2),
+    "flexicubes": (16, 1),
 }
-CORNERS = 8
-MERGED = 21  # 12 edges, 8 corners, 1 cube
+MERGED = (12, 8, 1)  # FlexiCubes weights of a cube: of its edges, its corners, itself
 
 
 def mlp(inputs: int, width: int, outputs: int, hidden: int) -> nn.Sequential:
@@ -73,7 +64,7 @@ class Heads(nn.ModuleDict):
     """One MLP per head, on shared features."""
 
     def __init__(self, features: int, width: int):
-        super().__init__({name: mlp(features, width, head.outputs, head.hidden) for name, head in HEADS.items()})
+        super().__init__({name: mlp(features, width, *sizes) for name, sizes in HEADS.items()})
 
     def forward(self, features: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
         """``{name: (..., outputs)}`` of features ``(..., features)``; values as :func:`activate` describes them.
@@ -85,15 +76,9 @@ class Heads(nn.ModuleDict):
                 raise ValueError(f"heads: expected some of {', '.join(self)}, got {name}")
         return {name: activate(name, self[name](features)) for name in names}
 
-    def at(self, triplane: Tensor, points: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
-        """``{name: (B, N, outputs)}`` at ``points (B, N, 3)`` of a triplane, both as for
-        :func:`~reli3d.geometry.triplane.sample_triplane`.  Gradients reach the triplane, the points and the heads.
-        """
-        return self(sample_triplane(triplane, points), names)
-
 
 class _TruncatedExp(torch.autograd.Function):
-    """exp whose derivative is clamped to exp(15), so that single points deep inside do not dominate a batch."""
+    """exp(x) whose derivative is clamped to exp(15), so that single points deep inside do not dominate a batch."""
 
     @staticmethod
     def forward(ctx, x: Tensor) -> Tensor:
@@ -106,9 +91,7 @@ class _TruncatedExp(torch.autograd.Function):
         return grad * x.clamp(max=15.0).exp()
 
 
-def truncated_exp(x: Tensor) -> Tensor:
-    """exp(x), with exp(min(x, 15)) as its derivative."""
-    return _TruncatedExp.apply(x)
+truncated_exp = _TruncatedExp.apply
 
 
 class WeightMerger(nn.Module):
@@ -116,7 +99,7 @@ class WeightMerger(nn.Module):
 
     def __init__(self, width: int):
         super().__init__()
-        self.mlp = mlp(CORNERS * HEADS["flexicubes"].outputs, width, MERGED, 2)
+        self.mlp = mlp(8 * HEADS["flexicubes"][0], width, sum(MERGED), 2)
 
     def merged(self, corners: Tensor) -> Tensor:
         """Raw weights ``(..., 21)`` of cubes from their corners ``(..., 8, 16)``.
@@ -130,7 +113,7 @@ class WeightMerger(nn.Module):
 
         alpha and beta are in (0.5, 1.5), gamma in (0.25, 0.75).
         """
-        beta, alpha, gamma = self.merged(corners).split((12, 8, 1), dim=-1)
+        beta, alpha, gamma = self.merged(corners).split(MERGED, dim=-1)
         return CubeWeights(
             alpha=1.0 + WEIGHT_SCALE * alpha.tanh(),
             beta=1.0 + WEIGHT_SCALE * beta.tanh(),

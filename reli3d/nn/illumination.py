@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from reli3d.nn.presets import IlluminationSizes
 from reli3d.nn.reni import rotation_from_6d
 from reli3d.nn.tokenizers import ImageTokenizer
-from reli3d.nn.transformer import GROUP_NORM_EPS, FeedForward, attention
+from reli3d.nn.transformer import GROUP_NORM_EPS, BasicBlock, FeedForward, attention
 
 STRENGTH_BIAS = 1.0  # added to the predicted natural logarithm of the radiance factor
 
@@ -27,21 +27,6 @@ class _CrossAttention(nn.Module):
         return self.to_out(attention(self.to_q(x), self.to_k(context), self.to_v(context), self.heads))
 
 
-class _Block(nn.Module):
-    def __init__(self, width: int, context: int, heads: int):
-        super().__init__()
-        self.norm1, self.norm2, self.norm3 = (nn.LayerNorm(width) for _ in range(3))
-        self.attn1 = _CrossAttention(width, width, heads)
-        self.attn2 = _CrossAttention(width, context, heads)
-        self.ff = FeedForward(width)
-
-    def forward(self, x: Tensor, context: Tensor) -> Tensor:
-        h = self.norm1(x)
-        x = x + self.attn1(h, h)
-        x = x + self.attn2(self.norm2(x), context)
-        return x + self.ff(self.norm3(x))
-
-
 class Transformer1D(nn.Module):
     """Tokens with self attention and cross attention to a context; the outer residual is the input before GroupNorm."""
 
@@ -50,7 +35,13 @@ class Transformer1D(nn.Module):
         self.norm = nn.GroupNorm(sizes.groups, sizes.token_width, eps=GROUP_NORM_EPS)
         self.proj_in = nn.Linear(sizes.token_width, sizes.width)
         self.transformer_blocks = nn.ModuleList(
-            _Block(sizes.width, sizes.encoder.hidden, sizes.heads) for _ in range(sizes.layers)
+            BasicBlock(
+                sizes.width,
+                _CrossAttention(sizes.width, sizes.width, sizes.heads),
+                _CrossAttention(sizes.width, sizes.encoder.hidden, sizes.heads),
+                FeedForward(sizes.width),
+            )
+            for _ in range(sizes.layers)
         )
         self.proj_out = nn.Linear(sizes.width, sizes.token_width)
 
@@ -62,22 +53,6 @@ class Transformer1D(nn.Module):
         return self.proj_out(x).transpose(1, 2) + tokens
 
 
-class _TokenBank(nn.Module):
-    def __init__(self, tokens: int, width: int):
-        super().__init__()
-        self.embeddings = nn.Parameter(torch.zeros(tokens, width))
-
-
-class _PlaneTokens(nn.Module):
-    def __init__(self, inputs: int, outputs: int):
-        super().__init__()
-        self.output_projection = nn.Linear(inputs, outputs)
-
-    def forward(self, planes: Tensor) -> Tensor:
-        """``(B, 3, C, S, S)`` to ``(B, 3*S*S, outputs)``, plane by plane and row by row."""
-        return self.output_projection(planes.movedim(2, -1).flatten(1, 3))
-
-
 class Illumination(nn.Module):
     """RENI++ latents, rotation and strength of the views."""
 
@@ -85,8 +60,9 @@ class Illumination(nn.Module):
         super().__init__()
         self.latents = latents
         self.encoder = ImageTokenizer(sizes.encoder, camera_width)
-        self.bank = _TokenBank(sizes.tokens, sizes.token_width)
-        self.plane_tokens = _PlaneTokens(plane_width, sizes.encoder.hidden)
+        self.bank = nn.ParameterDict({"embeddings": torch.zeros(sizes.tokens, sizes.token_width)})
+        projection = nn.Linear(plane_width, sizes.encoder.hidden)
+        self.plane_tokens = nn.ModuleDict({"output_projection": projection})
         self.transformer = Transformer1D(sizes)
 
     def forward(self, images: Tensor, extra: Tensor | None, camera: Tensor, planes: Tensor) -> tuple[Tensor, ...]:
@@ -97,8 +73,9 @@ class Illumination(nn.Module):
         P)`` before upsampling.
         """
         views = self.encoder(images, camera, extra).flatten(1, 2)
-        context = torch.cat([views, self.plane_tokens(planes)], dim=1)
-        tokens = self.bank.embeddings.t().expand(len(images), -1, -1)
+        of_planes = planes.movedim(2, -1).flatten(1, 3)  # plane by plane, row by row
+        context = torch.cat([views, self.plane_tokens["output_projection"](of_planes)], dim=1)
+        tokens = self.bank["embeddings"].t().expand(len(images), -1, -1)
         return unpack(self.transformer(tokens, context).float(), self.latents)
 
 

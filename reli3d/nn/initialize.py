@@ -6,9 +6,8 @@ from torch import nn
 
 from reli3d.nn.heads import Heads, WeightMerger
 from reli3d.nn.reni import EnvironmentDecoder
-from reli3d.nn.tokenizers import ImageTokenizer, Modulation, TriplaneBank
+from reli3d.nn.tokenizers import ImageTokenizer, Modulation, PixelShuffleUpsampler, TriplaneBank
 from reli3d.nn.transformer import TwoStreamTransformer
-from reli3d.nn.upsample import PixelShuffleUpsampler
 
 STD = 0.02  # truncated normal of transformer weights
 START_DENSITY_OFFSET = 2.0  # raw density below the surface's at the start: every point outside, probability about 0.12
@@ -42,13 +41,16 @@ def initialize(model: nn.Module) -> None:
         elif isinstance(module, TwoStreamTransformer):
             nn.init.trunc_normal_(module.latent_init, std=STD)
         elif isinstance(module, Heads):
-            _initialize_heads(module, model.surface_density - START_DENSITY_OFFSET)
+            _initialize_heads(module)
+            nn.init.constant_(module["density"][-1].bias, model.surface_density - START_DENSITY_OFFSET)
         elif isinstance(module, WeightMerger):
             _normal(module.mlp, 0.05)
         elif isinstance(module, PixelShuffleUpsampler):
             nn.init.normal_(module.upsample[-2].weight, std=1.0 / math.sqrt(module.upsample[-2].weight[0].numel()))
-        elif isinstance(module, EnvironmentDecoder):
-            _initialize_reni(module)
+        elif isinstance(module, EnvironmentDecoder):  # its inputs are of order one and it has norms of its own
+            for part in module.modules():
+                if isinstance(part, nn.Linear):
+                    part.reset_parameters()
     for stream in (model.backbone, model.illumination.transformer):
         _shrink(
             [m.proj for m in stream.modules() if hasattr(m, "wq")]
@@ -71,7 +73,7 @@ def _normal(layers: nn.Sequential, std: float) -> None:
             nn.init.zeros_(layer.bias)
 
 
-def _initialize_heads(heads: Heads, density: float) -> None:
+def _initialize_heads(heads: Heads) -> None:
     for name, layers in heads.items():
         for layer in layers:
             if isinstance(layer, nn.Linear):
@@ -80,11 +82,3 @@ def _initialize_heads(heads: Heads, density: float) -> None:
                 nn.init.uniform_(layer.bias, -bound, bound)
         if name in ("normal", "deformation"):
             _normal(layers, 0.01)
-    nn.init.constant_(heads["density"][-1].bias, density)
-
-
-def _initialize_reni(decoder: EnvironmentDecoder) -> None:
-    """Torch's default for linear layers: the decoder's inputs are of order one and it has norms of its own."""
-    for module in decoder.modules():
-        if isinstance(module, nn.Linear):
-            module.reset_parameters()

@@ -1,10 +1,9 @@
 """The small network: convolutions over each view, over space and over the sphere of directions.
 
 A 2D U-Net predicts base color, normal and depth per pixel of every view (``pyramid``); depths are refined by comparing
-the views (``cost_volume``); a 3D U-Net pools the views over
-the volume of the object (``volume``); a U-Net on lat-long maps completes the environment from the radiance that the
-surface reflects (``light_map``).  Small MLPs evaluate points from all three.  Positions enter only relative to the
-views and to the object.
+the views (``cost_volume``); a 3D U-Net pools the views over the volume of the object (``volume``); a U-Net on lat-long
+maps completes the environment from the radiance that the surface reflects (``light_map``).  Small MLPs evaluate points
+from all three.  Positions enter only relative to the views and to the object.
 """
 
 from __future__ import annotations
@@ -29,13 +28,7 @@ from reli3d.nn.heads import ROUGHNESS_MIN, color_logit, mlp
 from reli3d.nn.light_features import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.light_map import LightMap
 from reli3d.nn.presets import OFFSET_VIEWS, LocalPreset
-from reli3d.nn.pyramid import (
-    MIN_COVERAGE,
-    ImagePyramid,
-    depth_of_origin,
-    pixel_hull_depths,
-    pixel_positions,
-)
+from reli3d.nn.pyramid import MIN_COVERAGE, ImagePyramid, depth_of_origin, pixel_hull_depths, pixel_positions
 from reli3d.nn.view_features import AHEAD, ViewFeatures, ViewMaps, ahead_of_surface
 from reli3d.nn.view_lookup import fuse_views, summarize_views
 from reli3d.nn.volume import HULL_SCALE, FeatureVolume
@@ -47,9 +40,7 @@ LIGHT_ROWS = 16  # rows of the map whose irradiance the material heads read
 TOKEN_EXTRA = 4  # depth and world normal, appended to the pyramid's features
 QUARTER = 4  # pixels of a view per side of a pixel whose ray is intersected with the hull
 FUSED_WIDTH = 10  # width of Fused.numbers
-VIEW_WEIGHT = (
-    7  # of its columns: greatest blend weight of a view: about 0 where none shows the point, 1 where one faces it
-)
+VIEW_WEIGHT = 7  # of its columns: greatest blend weight of a view, 0 to 1: about 0 where none shows the point
 HEAD_OUTPUTS = 13  # width of LocalField.heads
 NORMAL_RIGHT = -5  # of the pyramid's predictions: changes its sign under a left-right flip of the image
 METALLIC_LOGIT = -2.0  # where the prediction is zero
@@ -105,6 +96,11 @@ class PixelMaps:
         """:meth:`stacked` in the layout of :func:`~reli3d.nn.view_lookup.fuse_views`, without gradient."""
         parts = self.stacked().detach().split([4, 4, 3], -1)
         return torch.stack([functional.pad(part, (0, 4 - part.shape[-1])) for part in parts])
+
+    def shape_at(self, side: int) -> Tensor:
+        """Means of depth and normal, ``(V, side, side, 4)``."""
+        shape = torch.cat([self.depth, self.normal], -1).permute(0, 3, 1, 2)
+        return functional.avg_pool2d(shape, shape.shape[-1] // side).permute(0, 2, 3, 1)
 
     def base_logit(self, color: Tensor) -> Tensor:
         """Base color logit ``(V, P, P, 3)`` of pixels with the observed ``color (V, P, P, 3)``, sRGB."""
@@ -182,6 +178,7 @@ class LocalReconstructor(nn.Module):
         detail_intrinsics: Tensor,
         *,
         mirrored: int = 0,
+        inference: bool = False,
     ) -> LocalField:
         """Encodes the posed views of one object, in the model's frame.
 
@@ -189,28 +186,20 @@ class LocalReconstructor(nn.Module):
         4)`` OpenGL.  intrinsics: ``(V, 4)`` in pixels of ``images``.  detail: ``(V, D, D, 4)``, sRGB and signed
         silhouette distance in pixels, from which colors are read.  detail_intrinsics: ``(V, 4)`` in its pixels.
         mirrored: number of views at the end that are the first views, flipped left to right, with mirrored cameras;
-        they are used for shape and material, not for lighting.  Gradients reach every parameter, those of the cost
-        volume with two or more input views.  Raises ValueError if
-        more than half of the views are mirrored.
+        they are used for shape and material, not for lighting.  inference: without gradient; the field evaluates points
+        by fused kernels, equal to float32 rounding, in blocks that fit the cache.  Gradients reach every parameter,
+        those of the cost volume with two or more input views.  Raises ValueError if more than half of the views are
+        mirrored.
         """
-        views = images, masks, c2w, intrinsics, detail, detail_intrinsics
-        return self._encoded(views, mirrored, inference=False)
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not inference):
+            views = images, masks, c2w, intrinsics, detail, detail_intrinsics
+            return self._encoded(views, mirrored, inference)
 
-    @torch.no_grad()
-    def encode_for_inference(self, *views: Tensor, mirrored: int = 0) -> LocalField:
-        """:meth:`encode` by fused kernels, equal to float32 rounding; no gradient.  ``views``: its six tensors.
-
-        The field evaluates points by fused kernels too, in blocks that fit the cache.
-        """
-        return self._encoded(views, mirrored, inference=True)
-
-    def _encoded(self, views: tuple[Tensor, ...], mirrored: int, *, inference: bool) -> LocalField:
+    def _encoded(self, views: tuple[Tensor, ...], mirrored: int, inference: bool) -> LocalField:
         images, masks, c2w, intrinsics, detail, detail_intrinsics = views
-        features, pixels, camera = self.read_pixels(images, masks, c2w, intrinsics, detail, detail_intrinsics, mirrored)
+        features, pixels, camera = self.read_pixels(*views, mirrored=mirrored)
         color, mask = pixel_colors(images, masks, camera)
-        shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
-        shape = functional.avg_pool2d(shape, camera.height // features.shape[1]).permute(0, 2, 3, 1)
-        tokens = torch.cat([features, shape], -1).contiguous()
+        tokens = torch.cat([features, pixels.shape_at(features.shape[1])], -1).contiguous()
         maps = ViewMaps(tokens, detail, Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1]), mirrored)
         surface = torch.cat([pixels.depth * mask, pixels.spread * mask, mask], -1)
         volume = self.volume(maps, surface, self.widening)
@@ -224,19 +213,13 @@ class LocalReconstructor(nn.Module):
         """Effect of uncertain depths, see :func:`~reli3d.nn.view_features.ahead_of_surface`."""
         return 0.0 if self.cost_volume is None else self.cost_volume.widening
 
-    def read_pixels(
-        self,
-        images: Tensor,
-        masks: Tensor,
-        c2w: Tensor,
-        intrinsics: Tensor,
-        detail: Tensor,
-        detail_intrinsics: Tensor,
-        mirrored: int = 0,
-    ) -> tuple[Tensor, PixelMaps, Camera]:
+    def read_pixels(self, *views: Tensor, mirrored: int = 0) -> tuple[Tensor, PixelMaps, Camera]:
         """The per-view maps of :meth:`encode`: features at a quarter of the resolution, predictions at half, and the
         cameras of the predictions.  The maps of mirror images are those of the input views, flipped.
+
+        views: the six tensors of :meth:`encode`.
         """
+        images, masks, c2w, intrinsics, detail, detail_intrinsics = views
         if not 0 <= 2 * mirrored <= len(images):
             raise ValueError(f"mirrored: expected at most half of the {len(images)} views, got {mirrored}")
         taken = len(images) - mirrored
@@ -287,8 +270,7 @@ def _refined_depth(
     count = len(features)
     quarter = camera.resized(features.shape[2], features.shape[1])
     color, coverage = pixel_colors(images[:count], masks[:count], quarter)
-    shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
-    shape = functional.avg_pool2d(shape, shape.shape[-1] // features.shape[2]).permute(0, 2, 3, 1)
+    shape = pixels.shape_at(features.shape[2])
     depth, normal = shape[..., 0], functional.normalize(shape[..., 1:], dim=-1)
     found, spread = volume(features, color, depth, normal, span, quarter, coverage[..., 0])
     change = torch.stack([found - depth, spread, (coverage[..., 0] > MIN_COVERAGE).to(depth)], 1)
@@ -317,7 +299,7 @@ class LocalField:
     volume: Tensor  # (N, N, N, F)
     log_light: Tensor  # (3, H, 2H)
     shading: Shading | None = None
-    inference: bool = False  # by encode_for_inference: points are evaluated without gradient
+    inference: bool = False  # points are evaluated without gradient, see LocalReconstructor.encode
 
     def bound(self, points: Tensor) -> Tensor:
         """Signed distance ``(N,)`` to the visual hull in units of ``softness``, a lower bound of :meth:`sdf`.
@@ -375,8 +357,7 @@ class LocalField:
         if self.inference:
             return self._fused_by_kernel(position, normal, visible)
         maps = self.maps
-        pixels = self.pixels.stacked()
-        got, _ = gather_views(pixels, position, maps.camera)
+        got, _ = gather_views(self.pixels.stacked(), position, maps.camera)
         shown, view_weight, summary = summarize_views(maps.images, maps.camera, position, visible, normal)
         gain, shift, confidence, rough, metal, chroma, fused = got.split([1, 3, 1, 1, 1, 1, 3], -1)
         hidden = (visible <= 0.0) & (summary[:, 5:6] >= CONFIDENT_WEIGHT)  # occluded, and another view is confident
@@ -427,18 +408,12 @@ class LocalField:
         Arguments as in :meth:`material`.  The outputs vary at the scale of volume cells, not of texels, so they may be
         evaluated at vertices and interpolated.
         """
-
-        def evaluate(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
-            return {"heads": self._heads(self.fused(position, normal, visible), position, normal, visible)}
-
+        evaluate = lambda p, n, v: {"heads": self._heads(self.fused(p, n, v), p, n, v)}  # noqa: E731
         return self._rows(evaluate, position, normal, visible)["heads"]
 
     def material_from_heads(self, heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> SurfacePoints:
         """:meth:`material` at surface points with given, possibly interpolated ``heads (N, HEAD_OUTPUTS)``."""
-
-        def evaluate(heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
-            return _material(self.fused(position, normal, visible), heads, normal)
-
+        evaluate = lambda h, p, n, v: _material(self.fused(p, n, v), h, n)  # noqa: E731
         return SurfacePoints(position, normal, **self._rows(evaluate, heads, position, normal, visible))
 
     def _heads(self, fused: Fused, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:

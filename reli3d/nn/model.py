@@ -9,15 +9,20 @@ from torch import Tensor, nn
 
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.nn.blocks import linear_of
-from reli3d.nn.camera import CameraEmbedder, camera_vector
 from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
 from reli3d.nn.illumination import Illumination
 from reli3d.nn.initialize import initialize
 from reli3d.nn.presets import Preset
 from reli3d.nn.reni import EnvironmentDecoder, reni_frame
-from reli3d.nn.tokenizers import ImageTokenizer, TriplaneBank, patch_grid
+from reli3d.nn.tokenizers import (
+    CameraEmbedder,
+    ImageTokenizer,
+    PixelShuffleUpsampler,
+    TriplaneBank,
+    camera_vector,
+    patch_grid,
+)
 from reli3d.nn.transformer import TwoStreamTransformer
-from reli3d.nn.upsample import PixelShuffleUpsampler
 
 BACKGROUND = 0.5  # gray behind the object in the object encoder's images, sRGB
 
@@ -129,7 +134,7 @@ class Reconstructor(nn.Module):
         :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points and the heads.
         """
         with torch.autocast(points.device.type, enabled=False):
-            values = self.heads.at(code.triplane, points / self.preset.radius, heads)
+            values = self.heads(sample_triplane(code.triplane, points / self.preset.radius), heads)
             if self.preset.roughness_is_alpha and "roughness" in values:
                 values["roughness"] = values["roughness"].sqrt()
         return values
@@ -157,7 +162,11 @@ class Reconstructor(nn.Module):
 
     def sdf(self, density: Tensor) -> Tensor:
         """Signed field values from the raw output of the ``density`` head: negative inside, zero on the surface."""
-        return self.preset.density_threshold - truncated_exp(density + self.preset.density_bias)
+        return self.preset.density_threshold - self.density(density)
+
+    def density(self, raw: Tensor) -> Tensor:
+        """Density per model unit from the raw output of the ``density`` head."""
+        return truncated_exp(raw + self.preset.density_bias)
 
     @property
     def surface_density(self) -> float:

@@ -20,11 +20,10 @@ MIN_COVERAGE = 0.1  # of a pixel whose ray is intersected with the hull
 CLIP_RADIUS = 0.87  # of the sphere around the origin that clips the hull: circumscribes a cube of side 1
 
 
-def block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    """3x3 convolution, group normalization over groups of eight channels, SiLU."""
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1), nn.GroupNorm(max(1, outputs // 8), outputs), nn.SiLU()
-    )
+def block(inputs: int, outputs: int, stride: int = 1, kind: type[nn.Conv2d | nn.Conv3d] = nn.Conv2d) -> nn.Sequential:
+    """Convolution ``kind`` of width 3, group normalization over groups of eight channels, SiLU."""
+    norm = nn.GroupNorm(max(1, outputs // 8), outputs)
+    return nn.Sequential(kind(inputs, outputs, 3, stride=stride, padding=1), norm, nn.SiLU())
 
 
 def channels_last(x: Tensor) -> Tensor:

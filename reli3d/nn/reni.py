@@ -28,21 +28,6 @@ def reni_frame(directions: Tensor) -> Tensor:
     return directions.roll(1, dims=-1)
 
 
-class _VnLinear(nn.Module):
-    """Linear map of vector channels, stored as scalars because every channel is a multiple of one vector."""
-
-    def __init__(self, inputs: int, outputs: int):
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(outputs, inputs))
-
-
-class _VnRelu(nn.Module):
-    def __init__(self, channels: int):
-        super().__init__()
-        # torch.eye on the meta device, on which weights.load builds, imports torch's compiler (2 seconds)
-        self.W, self.U = (nn.Parameter(torch.zeros(channels, channels).fill_diagonal_(1.0)) for _ in range(2))
-
-
 class _VnInvariant(nn.Module):
     """Two rotation invariants of a 2D vector p: <p, out_o> of a small vector-neuron network.
 
@@ -53,40 +38,32 @@ class _VnInvariant(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.mlp = nn.Sequential(_VnLinear(1, 2), _VnRelu(2))
+        # torch.eye on the meta device, on which weights.load builds, imports torch's compiler (2 seconds)
+        relu = [(name, torch.zeros(2, 2).fill_diagonal_(1.0)) for name in ("W", "U")]  # of a dict the names were sorted
+        self.mlp = nn.ModuleList([nn.ParameterDict({"weight": torch.ones(2, 1)}), nn.ParameterDict(relu)])
 
     def forward(self, p: Tensor) -> Tensor:
         """``(..., 2)`` to ``(..., 2)``."""
-        a = self.mlp[0].weight[:, 0]
-        alpha, beta = self.mlp[1].W @ a, self.mlp[1].U @ a
+        a = self.mlp[0]["weight"][:, 0]
+        alpha, beta = self.mlp[1]["W"] @ a, self.mlp[1]["U"] @ a
         n2 = p.square().sum(-1, keepdim=True)
         k = beta.abs() * n2.clamp_min(NORM2_MIN).sqrt()
         cut = 1.0 - k.square() / k.clamp_min(VN_EPS)
         return alpha * n2 * torch.where(alpha * beta >= 0.0, torch.ones_like(cut), cut)
 
 
-class _Conditioning(nn.Module):
-    """Attention of a ray to a token: a softmax over one key is 1; query and key exist only for the checkpoint."""
-
-    def __init__(self, width: int, condition: int):
-        super().__init__()
-        self.query = nn.Linear(width, width)
-        self.key, self.value = nn.Linear(condition, width), nn.Linear(condition, width)
-        self.fc_out = nn.Linear(width, width)
-
-    def forward(self, condition: Tensor) -> Tensor:
-        return self.fc_out(self.value(condition))
-
-
 class _DecoderLayer(nn.Module):
+    """Attention of a ray to one token, whose softmax is 1, and an MLP; query and key exist only for the checkpoint."""
+
     def __init__(self, width: int, condition: int):
         super().__init__()
-        self.mha = _Conditioning(width, condition)
+        inputs = {"query": width, "key": condition, "value": condition, "fc_out": width}
+        self.mha = nn.ModuleDict({name: nn.Linear(size, width) for name, size in inputs.items()})
         self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
         self.fc = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width))
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        x = self.norm1(x + self.mha(condition))
+        x = self.norm1(x + self.mha["fc_out"](self.mha["value"](condition)))
         return self.norm2(x + self.fc(x))
 
 
@@ -116,13 +93,13 @@ class ReniField(nn.Module):
 
     def __init__(self, sizes: ReniSizes):
         super().__init__()
-        self.vn_proj_in = nn.Sequential(nn.Identity(), _VnLinear(1, 1))
+        self.vn_proj_in = nn.ModuleList([nn.Identity(), nn.ParameterDict({"weight": torch.ones(1, 1)})])
         self.vn_invar = _VnInvariant()
         self.network = _Decoder(sizes)
 
     def conditioning(self, latent: Tensor) -> Tensor:
         """``(B, L, 3)`` to ``(B, 3 L)``: for each latent two invariants of its horizontal part, then its height."""
-        invariants = self.vn_invar(self.vn_proj_in[1].weight[0, 0] * latent[..., :2])
+        invariants = self.vn_invar(self.vn_proj_in[1]["weight"][0, 0] * latent[..., :2])
         return torch.cat([invariants, latent[..., 2:]], dim=-1).flatten(-2)
 
     @staticmethod

@@ -26,7 +26,18 @@ def fit_latent(
     which emphasizes light sources.  The decoder is not changed.  Raises TypeError unless float32, ValueError for
     another shape and for a map that is not finite, negative or black.  Source: Gardner et al. 2023, RENI++, section 4.
     """
-    directions, target, weight = _rays(decoder, radiance)
+    if radiance.dtype != torch.float32:
+        raise TypeError(f"radiance: expected torch.float32, got {radiance.dtype}")
+    height = radiance.shape[0] if radiance.ndim == 3 else 0
+    if height < 8 or radiance.shape != (height, 2 * height, 3):
+        raise ValueError(f"radiance: expected (H, 2H, 3) with H at least 8, got {tuple(radiance.shape)}")
+    if radiance.device != decoder.sample_directions.device:
+        raise ValueError(f"radiance: expected device {decoder.sample_directions.device}, got {radiance.device}")
+    if not bool(radiance.isfinite().all()) or bool((radiance < 0).any()) or not bool(radiance.any()):
+        raise ValueError("radiance: expected finite light of at least 0, got NaN, infinity, negative or black")
+    directions = reni_frame(lat_long_directions(height, device=radiance.device)).reshape(-1, 3)
+    rows = torch.sin((torch.arange(height, device=radiance.device, dtype=torch.float32) + 0.5) * math.pi / height)
+    target, weight = radiance.detach().reshape(-1, 3), rows.repeat_interleave(2 * height)  # up to a factor, solid angle
     shade = target.mean(-1)
     mean = (((shade + 1e-4 * shade.mean()).log() * weight).sum() / weight.sum()).exp()
     target, floor = target / mean, radiance.new_tensor(math.log(FLOOR))
@@ -54,19 +65,3 @@ def fit_latent(
         difference = (torch.logaddexp(logarithm(directions), floor) - (target + FLOOR).log()).abs().mean(-1)
         error = float((difference * weight).sum() / weight.sum())
         return latent.detach(), strength.detach() + mean.log(), error
-
-
-def _rays(decoder: EnvironmentDecoder, radiance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Directions ``(N, 3)`` in the decoder's frame, radiance ``(N, 3)`` and solid angle up to a factor ``(N,)``."""
-    if radiance.dtype != torch.float32:
-        raise TypeError(f"radiance: expected torch.float32, got {radiance.dtype}")
-    height = radiance.shape[0] if radiance.ndim == 3 else 0
-    if height < 8 or radiance.shape != (height, 2 * height, 3):
-        raise ValueError(f"radiance: expected (H, 2H, 3) with H at least 8, got {tuple(radiance.shape)}")
-    if radiance.device != decoder.sample_directions.device:
-        raise ValueError(f"radiance: expected device {decoder.sample_directions.device}, got {radiance.device}")
-    if not bool(radiance.isfinite().all()) or bool((radiance < 0).any()) or not bool(radiance.any()):
-        raise ValueError("radiance: expected finite light of at least 0, got NaN, infinity, negative or black")
-    directions = reni_frame(lat_long_directions(height, device=radiance.device)).reshape(-1, 3)
-    rows = torch.sin((torch.arange(height, device=radiance.device, dtype=torch.float32) + 0.5) * math.pi / height)
-    return directions, radiance.detach().reshape(-1, 3), rows.repeat_interleave(2 * height)

@@ -1,8 +1,8 @@
-"""Images to tokens: a vision transformer in the DINOv2 form with camera-modulated norms; the learned triplane bank.
+"""Images to tokens: a vision transformer in the DINOv2 form with camera-modulated norms; triplane tokens to planes.
 
-Source: DINOv2 (Oquab et al. 2023, arXiv 2304.07193) for the encoder; adaptive layer norm as in DiT (Peebles and Xie
-2023, arXiv 2212.09748).  Parameter names are the published checkpoint's.  A view's tokens are, in this order: class,
-patches row by row, camera.
+Sources: DINOv2 (Oquab et al. 2023, arXiv 2304.07193); adaptive layer norm as in DiT (Peebles and Xie 2023, arXiv
+2212.09748); pixel shuffle (Shi et al. 2016, arXiv 1609.05158).  Parameter names are the published checkpoint's.  A
+view's tokens are, in this order: class, patches row by row, camera.
 """
 
 import math
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from reli3d.nn.presets import EncoderSizes
+from reli3d.nn.presets import EncoderSizes, UpsamplerSizes
 from reli3d.nn.transformer import attention, by_tokens
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)  # of ImageNet in sRGB, as DINOv2 was trained
@@ -20,6 +20,29 @@ NORM_EPS = 1.0e-6
 # The published network passes (patches + 0.1) / grid as scale factor, to guard the floor in the size computation; the
 # sampling positions then use this factor and not patches / grid.
 RESAMPLE_OFFSET = 0.1
+
+
+def camera_vector(c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
+    """The 25 numbers of a view: camera-to-world row by row, then the 3x3 intrinsics divided by the image size.
+
+    c2w: ``(..., 4, 4)``.  intrinsics: ``(..., 4)`` fx, fy, cx, cy in pixels of an image of ``size`` by ``size``.
+    """
+    fx, fy, cx, cy = (intrinsics / size).unbind(-1)
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    normalized = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], dim=-1)
+    return torch.cat([c2w.flatten(-2), normalized], dim=-1)
+
+
+class CameraEmbedder(nn.Module):
+    """One affine map of the 25 camera numbers, :func:`camera_vector`."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.linear = nn.Linear(25, width)
+
+    def forward(self, vector: Tensor) -> Tensor:
+        """``(..., 25)`` to ``(..., width)``."""
+        return self.linear(vector)
 
 
 class Modulation(nn.Module):
@@ -35,34 +58,16 @@ class Modulation(nn.Module):
         return torch.addcmul(shift, x, 1.0 + scale)
 
 
-class _QueryKeyValue(nn.Module):
-    def __init__(self, hidden: int):
-        super().__init__()
-        self.query, self.key, self.value = (nn.Linear(hidden, hidden) for _ in range(3))
-
-
-class _Output(nn.Module):
-    def __init__(self, hidden: int):
-        super().__init__()
-        self.dense = nn.Linear(hidden, hidden)
-
-
 class _SelfAttention(nn.Module):
     def __init__(self, hidden: int, heads: int):
         super().__init__()
         self.heads = heads
-        self.attention = _QueryKeyValue(hidden)
-        self.output = _Output(hidden)
+        self.attention = nn.ModuleDict({name: nn.Linear(hidden, hidden) for name in ("query", "key", "value")})
+        self.output = nn.ModuleDict({"dense": nn.Linear(hidden, hidden)})
 
     def forward(self, x: Tensor) -> Tensor:
-        a = self.attention
-        return self.output.dense(attention(a.query(x), a.key(x), a.value(x), self.heads))
-
-
-class _Scale(nn.Module):
-    def __init__(self, hidden: int):
-        super().__init__()
-        self.lambda1 = nn.Parameter(torch.ones(hidden))
+        q, k, v = (linear(x) for linear in self.attention.values())
+        return self.output["dense"](attention(q, k, v, self.heads))
 
 
 class _Mlp(nn.Module):
@@ -75,7 +80,7 @@ class _Mlp(nn.Module):
         return by_tokens(lambda part: self.fc2(functional.gelu(self.fc1(part))), x, self.fc1.out_features)
 
 
-class _Layer(nn.Module):
+class EncoderLayer(nn.Module):
     """Pre-norm attention and MLP, both norms modulated by the camera."""
 
     def __init__(self, hidden: int, heads: int):
@@ -83,23 +88,17 @@ class _Layer(nn.Module):
         self.norm1 = nn.LayerNorm(hidden, eps=NORM_EPS)
         self.norm1_modulation = Modulation(hidden)
         self.attention = _SelfAttention(hidden, heads)
-        self.layer_scale1 = _Scale(hidden)
+        self.layer_scale1 = nn.ParameterDict({"lambda1": torch.ones(hidden)})
         self.norm2 = nn.LayerNorm(hidden, eps=NORM_EPS)
         self.norm2_modulation = Modulation(hidden)
         self.mlp = _Mlp(hidden)
-        self.layer_scale2 = _Scale(hidden)
+        self.layer_scale2 = nn.ParameterDict({"lambda1": torch.ones(hidden)})
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         h = self.norm1_modulation(self.norm1(x), condition)
-        x = torch.addcmul(x, self.layer_scale1.lambda1, self.attention(h))
+        x = torch.addcmul(x, self.layer_scale1["lambda1"], self.attention(h))
         h = self.norm2_modulation(self.norm2(x), condition)
-        return torch.addcmul(x, self.layer_scale2.lambda1, self.mlp(h))
-
-
-class _PatchEmbeddings(nn.Module):
-    def __init__(self, sizes: EncoderSizes):
-        super().__init__()
-        self.projection = nn.Conv2d(sizes.channels, sizes.hidden, sizes.patch, stride=sizes.patch)
+        return torch.addcmul(x, self.layer_scale2["lambda1"], self.mlp(h))
 
 
 class _Embeddings(nn.Module):
@@ -108,25 +107,21 @@ class _Embeddings(nn.Module):
         self.cls_token = nn.Parameter(torch.zeros(1, 1, sizes.hidden))
         self.position_embeddings = nn.Parameter(torch.zeros(1, 1 + sizes.grid**2, sizes.hidden))
         self.register_buffer("mask_token", torch.zeros(1, sizes.hidden))  # of the pretraining; stored, never read
-        self.patch_embeddings = _PatchEmbeddings(sizes)
+        projection = nn.Conv2d(sizes.channels, sizes.hidden, sizes.patch, stride=sizes.patch)
+        self.patch_embeddings = nn.ModuleDict({"projection": projection})
 
     def forward(self, pixels: Tensor) -> Tensor:
-        patches = self.patch_embeddings.projection(pixels)
+        patches = self.patch_embeddings["projection"](pixels)
         tokens = torch.cat([self.cls_token.expand(len(pixels), -1, -1), patches.flatten(2).transpose(1, 2)], dim=1)
         return tokens + resample_positions(self.position_embeddings, patches.shape[-2], patches.shape[-1])
-
-
-class _Layers(nn.Module):
-    def __init__(self, sizes: EncoderSizes):
-        super().__init__()
-        self.layer = nn.ModuleList(_Layer(sizes.hidden, sizes.heads) for _ in range(sizes.layers))
 
 
 class _VisionTransformer(nn.Module):
     def __init__(self, sizes: EncoderSizes):
         super().__init__()
         self.embeddings = _Embeddings(sizes)
-        self.encoder = _Layers(sizes)
+        layers = nn.ModuleList(EncoderLayer(sizes.hidden, sizes.heads) for _ in range(sizes.layers))
+        self.encoder = nn.ModuleDict({"layer": layers})
         self.layernorm = nn.LayerNorm(sizes.hidden, eps=NORM_EPS)
 
 
@@ -167,7 +162,7 @@ class ImageTokenizer(nn.Module):
             pixels = torch.cat([pixels, extra.to(pixels.dtype)], dim=2)
         condition = self.modulation_projection(camera.to(dtype))
         x = self.model.embeddings(pixels.flatten(0, 1).to(dtype))
-        for layer in self.model.encoder.layer:
+        for layer in self.model.encoder["layer"].children():
             x = layer(x, condition.flatten(0, 1))
         x = self.model.layernorm(x).unflatten(0, images.shape[:2])
         return torch.cat([x, condition.unsqueeze(2)], dim=2)
@@ -193,3 +188,19 @@ class TriplaneBank(nn.Module):
     def planes(self, tokens: Tensor) -> Tensor:
         """``(B, C, 3*S*S)`` back to ``(B, 3, C, S, S)``."""
         return tokens.unflatten(2, (3, *self.embeddings.shape[2:])).transpose(1, 2)
+
+
+class PixelShuffleUpsampler(nn.Module):
+    """3x3 convolutions with ReLU between them; pixel (y*s + i, x*s + j) of channel c is channel (c*s + i)*s + j."""
+
+    def __init__(self, sizes: UpsamplerSizes, width: int):
+        super().__init__()
+        layers = []
+        for _ in range(sizes.convolutions - 1):
+            layers += [nn.Conv2d(width, width, 3, padding=1), nn.ReLU()]
+        layers += [nn.Conv2d(width, sizes.channels * sizes.scale**2, 3, padding=1), nn.PixelShuffle(sizes.scale)]
+        self.upsample = nn.Sequential(*layers)
+
+    def forward(self, planes: Tensor) -> Tensor:
+        """``(B, 3, C, S, S)`` to ``(B, 3, channels, scale*S, scale*S)``."""
+        return self.upsample(planes.flatten(0, 1)).unflatten(0, planes.shape[:2])

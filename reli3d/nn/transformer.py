@@ -93,18 +93,17 @@ class Experts(nn.Module):
 
 
 class BasicBlock(nn.Module):
-    """Latents: self attention, cross attention to the raw tokens of all views, feed-forward or experts."""
+    """Tokens: self attention, cross attention to a context, which enters without a norm, feed-forward."""
 
-    def __init__(self, width: int, heads: int, experts: int):
+    def __init__(self, width: int, attn1: nn.Module, attn2: nn.Module, feed_forward: nn.Module):
         super().__init__()
         self.norm1, self.norm2, self.norm3 = (nn.LayerNorm(width) for _ in range(3))
-        self.attn1, self.attn2 = Attention(width, heads), Attention(width, heads)
-        self.ff = Experts(width, experts) if experts else FeedForward(width)
+        self.attn1, self.attn2, self.ff = attn1, attn2, feed_forward
 
-    def forward(self, z: Tensor, views: Tensor) -> Tensor:
+    def forward(self, z: Tensor, context: Tensor) -> Tensor:
         h = self.norm1(z)
         z = z + self.attn1(h, h)
-        z = z + self.attn2(self.norm2(z), views)
+        z = z + self.attn2(self.norm2(z), context)
         return z + self.ff(self.norm3(z))
 
 
@@ -128,8 +127,13 @@ class MainBlock(nn.Module):
     def __init__(self, width: int, heads: int, basic_blocks: int, experts: int):
         super().__init__()
         self.fuse_block_in = FuseBlock(width, heads)
-        self.transformer_block = nn.ModuleList(BasicBlock(width, heads, experts) for _ in range(basic_blocks))
+        self.transformer_block = nn.ModuleList(self._basic(width, heads, experts) for _ in range(basic_blocks))
         self.fuse_block_out = FuseBlock(width, heads)
+
+    @staticmethod
+    def _basic(width: int, heads: int, experts: int) -> BasicBlock:
+        attentions = Attention(width, heads), Attention(width, heads)
+        return BasicBlock(width, *attentions, Experts(width, experts) if experts else FeedForward(width))
 
     def forward(self, latents: Tensor, planes: Tensor, views: Tensor) -> tuple[Tensor, Tensor]:
         latents = self.fuse_block_in(latents, planes)

@@ -19,6 +19,7 @@ from reli3d.geometry.projection import gather_views
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import visible_from
 from reli3d.nn.blocks import linear_of
+from reli3d.nn.pyramid import depth_of_origin
 from reli3d.nn.view_lookup import NUMBERS, pool_views, summarize_views
 
 INTERPOLATION_ERROR = 1e-4  # bound on the float32 error of interpolated zeros and ones
@@ -45,9 +46,8 @@ class ViewMaps:
         """The input views alone, without mirror images."""
         if not self.mirrored:
             return self
-        return ViewMaps(
-            self.tokens[: self.input_count], self.images[: self.input_count], self.camera[: self.input_count]
-        )
+        count = self.input_count
+        return ViewMaps(self.tokens[:count], self.images[:count], self.camera[:count])
 
     def visibility(self, scene: RayScene, position: Tensor, normal: Tensor) -> Tensor:
         """``(N, V)`` float32, 1 where a surface point is visible; in mirror images only if it is in no input view.
@@ -109,15 +109,13 @@ def ahead_of_surface(surface: Tensor, maps: ViewMaps, points: Tensor, widening: 
     """
     got, pixel = gather_views(surface, points, maps.camera)
     covered = got[..., 2].clamp(min=0.1)
-    c2w = maps.camera.c2w
-    origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)
-    ahead = got[..., 0] / covered - (pixel[..., 2] - origin)
+    ahead = got[..., 0] / covered - (pixel[..., 2] - depth_of_origin(maps.camera.c2w))
     shown = (got[..., 2] > 0.5).to(ahead)
     wider = widening * (got[..., 1] / covered).square()
     scales = [(scale**2 + wider).clamp(min=scale**2 / 4).sqrt() for scale in (NEAR_DISTANCE, FAR_DISTANCE)]
     near, far = ((ahead / scale).tanh() * shown for scale in scales)
     fraction = shown.mean(1)
-    few = fraction.clamp(min=0.5 / len(c2w))
+    few = fraction.clamp(min=0.5 / len(surface))
     greatest = (near - 2.0 * (1.0 - shown)).amax(1).clamp(min=-1.0)
     return torch.stack([greatest, near.mean(1) / few, far.mean(1) / few, fraction], -1)
 

@@ -1,5 +1,7 @@
 """Feature volume of an object: view features pooled on a grid, a 3D U-Net, and trilinear lookup."""
 
+from functools import partial
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -8,6 +10,7 @@ from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_grid
 from reli3d.geometry.projection import gather_views
 from reli3d.nn.presets import VolumeSizes
+from reli3d.nn.pyramid import block
 from reli3d.nn.view_features import AHEAD, ViewMaps, ahead_of_surface
 from reli3d.nn.view_lookup import NUMBERS, summarize_views
 
@@ -16,10 +19,7 @@ HULL_SCALE = 0.1  # model units per unit of the hull distance as a feature
 HIDDEN, SPREAD = 32, 24  # widths of the two layers on the features of a view
 
 
-def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv3d(inputs, outputs, 3, stride=stride, padding=1), nn.GroupNorm(max(1, outputs // 8), outputs), nn.SiLU()
-    )
+_block = partial(block, kind=nn.Conv3d)
 
 
 class FeatureVolume(nn.Module):

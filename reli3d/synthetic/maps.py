@@ -14,16 +14,7 @@ from reli3d.render.latlong import lat_long_directions, quarter_turn, texel_solid
 
 ROWS = 64
 # of numpy, zipfile and zlib for a cut, changed, encrypted or unknown file; TypeError and AttributeError: an .npy file
-BROKEN_ARCHIVE = (
-    ValueError,
-    TypeError,
-    AttributeError,
-    OSError,
-    EOFError,
-    RuntimeError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+BROKEN = (ValueError, TypeError, AttributeError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
 HELD_OUT_EVERY = 6  # every sixth map is held out of all training
 
 
@@ -39,7 +30,7 @@ def load_maps(path: Path) -> tuple[Tensor, list[str]]:
             env, names = data["env"], [str(n) for n in data["names"]]
     except KeyError as error:
         raise InputError(path, f"expected an .npz of env and names, got none of {error}") from None
-    except BROKEN_ARCHIVE as error:
+    except BROKEN as error:
         raise InputError(path, f"expected an .npz of env and names, got a broken file ({shown(str(error))})") from None
     if env.dtype.kind != "f" or env.ndim != 4 or env.shape[3] != 3 or env.shape[2] != 2 * env.shape[1] or not env.size:
         raise InputError(path, f"env: expected floats of shape (n, H, 2H, 3), got {env.dtype} {env.shape}")

@@ -10,6 +10,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from reli3d._bridge import check
 from reli3d.synthetic.noise import fbm
 
 ALBEDO_RANGE = (0.02, 0.9)  # coal to fresh snow
@@ -27,19 +28,13 @@ class Coat:
 
 
 class Pattern(Protocol):
-    """Blend weight of a layer over the surface."""
-
     def weight(self, points: Tensor, normals: Tensor) -> Tensor:
-        """``(N,)`` in [0, 1] at surface points and normals ``(N, 3)``."""
-        ...
+        """Blend weight ``(N,)`` in [0, 1] of a layer at surface points and normals ``(N, 3)``."""
 
 
 class Bump(Protocol):
-    """Height field over the surface."""
-
     def height_gradient(self, points: Tensor, normals: Tensor) -> Tensor:
-        """Gradient ``(N, 3)`` of the height at surface points and normals ``(N, 3)``."""
-        ...
+        """Gradient ``(N, 3)`` of a height field at surface points and normals ``(N, 3)``."""
 
 
 Layer = tuple[Coat, Pattern]
@@ -71,13 +66,11 @@ class Material:
             roughness = roughness + self.drift_roughness * noise
         bumped = normals
         if self.bumps:
-            height_gradient = torch.stack([bump.height_gradient(points, normals) for bump in self.bumps]).sum(0)
-            height_gradient = height_gradient - normals * (height_gradient * normals).sum(-1, keepdim=True)
-            size = height_gradient.norm(dim=-1, keepdim=True)
-            height_gradient = height_gradient * (
-                MAX_HEIGHT_GRADIENT * torch.tanh(size / MAX_HEIGHT_GRADIENT) / size.clamp(min=1e-8)
-            )
-            bumped = torch.nn.functional.normalize(normals - height_gradient, dim=-1)
+            gradient = torch.stack([bump.height_gradient(points, normals) for bump in self.bumps]).sum(0)
+            gradient = gradient - normals * (gradient * normals).sum(-1, keepdim=True)  # in the tangent plane
+            size = gradient.norm(dim=-1, keepdim=True)
+            limited = MAX_HEIGHT_GRADIENT * torch.tanh(size / MAX_HEIGHT_GRADIENT)
+            bumped = torch.nn.functional.normalize(normals - gradient * (limited / size.clamp(min=1e-8)), dim=-1)
         return color.clamp(*ALBEDO_RANGE), roughness.clamp(*ROUGHNESS_RANGE), value[:, 4].clamp(0, 1), bumped
 
 
@@ -89,11 +82,8 @@ def evaluate(
     Returns base color ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)`` and bump-mapped normal ``(N, 3)``, float32.
     Raises TypeError unless float32, ValueError for a wrong shape or index.
     """
-    for name, value in (("points", points), ("normals", normals)):
-        if value.dtype != torch.float32:
-            raise TypeError(f"{name}: expected float32, got {value.dtype}")
-        if value.ndim != 2 or value.shape[1] != 3 or len(value) != len(part):
-            raise ValueError(f"{name}: expected shape ({len(part)}, 3), got {tuple(value.shape)}")
+    check("points", points, shape=(len(part), 3))
+    check("normals", normals, shape=(len(part), 3))
     if len(part) and not (int(part.min()) >= 0 and int(part.max()) < len(materials)):
         raise ValueError(f"part: expected 0 to {len(materials) - 1}, got {int(part.min())} to {int(part.max())}")
     color, bumped = torch.empty_like(points), torch.empty_like(points)

@@ -1,6 +1,5 @@
 """Solid noise with gradients: fractal sums of gradient noise, and cellular noise."""
 
-import torch
 from torch import Tensor
 
 from reli3d import _bridge
@@ -16,12 +15,12 @@ def fbm(
     absolute values (turbulence, Perlin 1985).  Not differentiable by autograd.  Raises TypeError unless float32,
     ValueError for a wrong shape or ``octaves`` outside 1 to 16.
     """
-    points = _points(points)
+    _bridge.check("points", points, shape=("N", 3))
     if not 1 <= octaves <= 16:
         raise ValueError(f"octaves: expected 1 to 16, got {octaves}")
     value = points.new_empty(len(points))
-    gradient = torch.empty_like(points)
-    args = [points, int(octaves), float(gain), int(ridged), int(seed) & 0xFFFFFF, value, gradient]
+    gradient = points.new_empty(points.shape)
+    args = [points.contiguous(), int(octaves), float(gain), int(ridged), int(seed) & 0xFFFFFF, value, gradient]
     _bridge.launch(kernels.fbm_kernel, len(points), args, points.device)
     return value, gradient
 
@@ -32,15 +31,10 @@ def cells(points: Tensor, *, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     Returns the distances to the nearest two feature points ``(N, 2)``, a random number in [0, 1) of the nearest one
     ``(N,)``, and the gradient of the second minus the first distance ``(N, 3)``.  Not differentiable by autograd.
     """
-    points = _points(points)
+    _bridge.check("points", points, shape=("N", 3))
     distance = points.new_empty((len(points), 2))
     cell = points.new_empty(len(points))
-    gradient = torch.empty_like(points)
-    args = [points, int(seed) & 0xFFFFFF, distance, cell, gradient]
+    gradient = points.new_empty(points.shape)
+    args = [points.contiguous(), int(seed) & 0xFFFFFF, distance, cell, gradient]
     _bridge.launch(kernels.cells_kernel, len(points), args, points.device)
     return distance, cell, gradient
-
-
-def _points(points: Tensor) -> Tensor:
-    _bridge.check("points", points, shape=("N", 3))
-    return points.contiguous()

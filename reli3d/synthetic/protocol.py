@@ -60,24 +60,17 @@ def framed_cameras(vertices: Tensor, rng: np.random.Generator, count: int, size:
     direction = torch.as_tensor(away, dtype=torch.float32)
     c2w = look_at(direction, torch.zeros(count, 3), torch.tensor([0.0, 1.0, 0.0]))
     tangent = torch.as_tensor(np.tan(fov / 2), dtype=torch.float32)
-    tangent_limit = tangent * (1.0 - 2.0 * torch.as_tensor(padding, dtype=torch.float32))
-    fitted = [fill_distance(vertices, m[:3, :3], float(k)) for m, k in zip(c2w, tangent_limit, strict=True)]
+    limit = tangent * (1.0 - 2.0 * torch.as_tensor(padding, dtype=torch.float32))
+    fitted = []  # distance of a camera at which the vertices fill its frame, and depth of the nearest vertex
+    for rotation, most in zip(c2w[:, :3, :3], limit.tolist(), strict=True):
+        x, y, z = (vertices @ rotation).unbind(-1)
+        reach = float((torch.maximum(x.abs(), y.abs()) / most + z).max())
+        fitted.append((reach, reach - float(z.max())))
     distance, nearest = torch.tensor(fitted).unbind(-1)
     c2w[:, :3, 3] = direction * distance[:, None] + shift * (tangent * nearest)[:, None]
     focal = 0.5 * size / tangent
     middle = torch.full_like(focal, 0.5 * size)
     return Camera(c2w, torch.stack([focal, focal, middle, middle], -1), size, size)
-
-
-def fill_distance(vertices: Tensor, rotation: Tensor, tangent_limit: float) -> tuple[float, float]:
-    """Distance of a camera from the origin at which ``vertices`` fill its frame, and the depth of the nearest vertex.
-
-    rotation: ``(3, 3)``, columns right, up, back.  tangent_limit: largest ratio of the distance from the optical axis,
-    along right or up, to the depth.
-    """
-    x, y, z = (vertices @ rotation).unbind(-1)
-    distance = float((torch.maximum(x.abs(), y.abs()) / tangent_limit + z).max())
-    return distance, distance - float(z.max())
 
 
 def lights_of(count: int, columns: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

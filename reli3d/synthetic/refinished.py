@@ -106,15 +106,12 @@ class RefinishedSurface:
         if self._region is None:
             return self._finishes[0](points)
         region = self._region(original)
-        fields = ("position", "ng", "normal", "base_color", "roughness", "metallic")
-        values = [getattr(points, name).clone() for name in fields]
+        changed = {name: value.clone() for name, value in vars(points).items()}
         for k, finish in enumerate(self._finishes):
             rows = (region == k).nonzero()[:, 0]
-            if len(rows):
-                changed = finish(points[rows])
-                for value, name in zip(values, fields, strict=True):
-                    value[rows] = getattr(changed, name)
-        return SurfacePoints(*values)
+            for name, value in vars(finish(points[rows])).items() if len(rows) else ():
+                changed[name][rows] = value
+        return SurfacePoints(**changed)
 
 
 def _draw_region(base: Surface, rng: np.random.Generator, count: int) -> Region:
@@ -176,7 +173,8 @@ def _draw_finish(
         role = str(rng.choice(ROLES))
         box = np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]])
         (material,) = draw_materials(rng, [role], box[None])
-        return lambda p: _with_material(p, *material.at(p.position, p.normal))
+        names = ("base_color", "roughness", "metallic", "normal")
+        return lambda p: replace(p, **dict(zip(names, material.at(p.position, p.normal))))
     if kind == "keep" and measured:
         return lambda p: p
     metallic = float(rng.random() < (0.45 if kind == "recoat" else 0.06))
@@ -189,13 +187,9 @@ def _draw_finish(
         color = p.base_color
         if metallic:  # metals reflect at least a third
             color = 0.35 + 0.6 * linear_to_srgb(color.clamp(0, 1))
-        return SurfacePoints(p.position, p.ng, p.normal, color, rough, torch.full_like(rough, metallic))
+        return replace(p, base_color=color, roughness=rough, metallic=torch.full_like(rough, metallic))
 
     return recoat
-
-
-def _with_material(p: SurfacePoints, color: Tensor, rough: Tensor, metal: Tensor, normal: Tensor) -> SurfacePoints:
-    return SurfacePoints(p.position, p.ng, normal, color, rough, metal)
 
 
 def _set_finish(folder: Path, rng: np.random.Generator, texels: int) -> Finish:
@@ -222,7 +216,8 @@ def _set_finish(folder: Path, rng: np.random.Generator, texels: int) -> Finish:
             bend[:, u] += tilt[:, 0]
             bend[:, v] += tilt[:, 1]
         normal = functional.normalize(p.normal + strength * bend, dim=-1)
-        rough = (number[:, 0] + shift).clamp(0.04, 1.0)
-        return _with_material(p, (color * gain).clamp(0.0, MAX_ALBEDO), rough, number[:, 1].clamp(0, 1), normal)
+        rough, metal = (number[:, 0] + shift).clamp(0.04, 1.0), number[:, 1].clamp(0, 1)
+        color = (color * gain).clamp(0.0, MAX_ALBEDO)
+        return replace(p, base_color=color, roughness=rough, metallic=metal, normal=normal)
 
     return finish

@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from reli3d.geometry.camera import Camera, camera_rays, project
 from reli3d.geometry.distance import signed_distance
+from reli3d.geometry.mesh import face_normals
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import visible_from
 from reli3d.render.color import linear_to_srgb
@@ -35,11 +36,8 @@ VOLUME_POINTS, SURFACE_POINTS, PIXELS = 16384, 8192, 1024
 
 
 def crop_camera(vertices: Tensor, c2w: Tensor, size: int, padding: float) -> Tensor:
-    """Intrinsics ``(4,)`` that fit the projection of ``vertices`` into a ``size`` square with a relative
-    ``padding``.
-    """
-    unit = torch.tensor([1.0, 1.0, 0.0, 0.0])
-    xy, _ = project(vertices, c2w, unit)
+    """Intrinsics ``(4,)`` that fit the projected ``vertices`` into a ``size`` square with a relative ``padding``."""
+    xy, _ = project(vertices, c2w, torch.tensor([1.0, 1.0, 0.0, 0.0]))
     low, high = xy.amin(0), xy.amax(0)
     focal = size * (1 - 2 * padding) / (high - low).max()
     center = size / 2 - focal * (low + high) / 2
@@ -65,8 +63,7 @@ def enclosed(points: Tensor, scene: RayScene) -> Tensor:
 def outer_faces(vertices: Tensor, faces: Tensor, scene: RayScene) -> Tensor:
     """Faces ``(F,)`` bool of which a point, on either side, is not :func:`enclosed`; all if every one is."""
     corners = vertices[faces.long()]
-    across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    offset = OFF_SURFACE * functional.normalize(across, dim=-1)
+    offset = OFF_SURFACE * functional.normalize(face_normals(vertices, faces), dim=-1)
     center, outer = corners.mean(1), torch.zeros(len(faces), dtype=torch.bool)
     for points in (center, *(0.4 * center[:, None] + 0.6 * corners).unbind(1)):
         rows = (~outer).nonzero()[:, 0]
@@ -99,6 +96,7 @@ class ObjectSurface:
         self.faces = torch.as_tensor(shape.faces)
         self.corner_normals = torch.as_tensor(shape.normals)
         self.part = torch.as_tensor(shape.part)
+        self.ng = functional.normalize(face_normals(self.vertices, self.faces), dim=-1)
         self.scene = RayScene(self.vertices, self.faces)
         self.outer = outer_faces(self.vertices, self.faces, self.scene)
 
@@ -107,15 +105,10 @@ class ObjectSurface:
 
     def points_at(self, face: Tensor, bary: Tensor) -> SurfacePoints:
         weights = torch.stack([1 - bary.sum(-1), bary[:, 0], bary[:, 1]], -1)[..., None]
-        corners = self.vertices[self.faces[face].long()]
-        across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        ng, normal = (
-            functional.normalize(across, dim=-1),
-            functional.normalize((self.corner_normals[face] * weights).sum(1), dim=-1),
-        )
-        position = (corners * weights).sum(1)
+        position = (self.vertices[self.faces[face].long()] * weights).sum(1)
+        normal = functional.normalize((self.corner_normals[face] * weights).sum(1), dim=-1)
         base, rough, metal, bump = evaluate(self.shape.materials, position, normal, self.part[face])
-        return SurfacePoints(position, ng, bump, base, rough, metal)
+        return SurfacePoints(position, self.ng[face], bump, base, rough, metal)
 
 
 def _render(surface: Surface, camera: Camera, light: Environment, seed: int):

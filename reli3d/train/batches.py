@@ -14,7 +14,9 @@ from reli3d._bridge import mapped
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.symmetry import MirrorPlane
+from reli3d.nn.pyramid import depth_of_origin
 from reli3d.render.latlong import lat_long_directions, quarter_turn
+from reli3d.synthetic.procedural import yaw_matrix
 from reli3d.train.mirror import mirrored_visibility, surface_mirror
 from reli3d.train.relight import Finish, draw_flash, draw_light, relight_views
 from reli3d.views.views import Views
@@ -31,8 +33,7 @@ UNCHANGED_PROBABILITY = 0.75  # of not mirroring, and of not permuting the color
 
 def random_turn(rng: np.random.Generator) -> Tensor:
     """Random rotation ``(3, 3)``: a yaw about +Y, with OTHER_UP_PROBABILITY followed by a change of the up axis."""
-    a = rng.uniform(0, 2 * np.pi)
-    yaw = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    yaw = yaw_matrix(rng.uniform(0, 2 * np.pi))
     if rng.random() < OTHER_UP_PROBABILITY:
         ups = (
             [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
@@ -48,6 +49,19 @@ def finish_known(file: safe_open) -> Tensor:
     if "finish_known" in file.keys():  # noqa: SIM118 - no iterable
         return file.get_tensor("finish_known").bool()
     return torch.ones_like(file.get_tensor("c2w")[:, 0, 0], dtype=torch.bool)
+
+
+def permuted(rng: np.random.Generator, *values: Tensor) -> list[Tensor]:
+    """``values (..., C)`` with their first three channels, the colors, in one random order."""
+    order = torch.as_tensor(rng.permutation(3), device=values[0].device)
+    return [torch.cat([v[..., order], v[..., 3:]], -1) for v in values]
+
+
+def with_noise(color: Tensor, rng: np.random.Generator) -> Tensor:
+    """``color``, sRGB, with normal noise of a random deviation of at most MAX_NOISE."""
+    source = torch.Generator(color.device).manual_seed(int(rng.integers(1 << 62)))
+    noise = torch.randn(color.shape, generator=source, device=color.device)
+    return (color + float(rng.random()) * MAX_NOISE * noise).clamp(0, 1)
 
 
 def valid_means(values: Tensor, valid: Tensor, factor: int) -> Tensor:
@@ -115,15 +129,14 @@ def load_sample(
             whole = file.get_slice(key)
             return torch.stack([whole[k] for k in chosen])
 
-        def run(key: str, count: int, low: int, high: int, rng: np.random.Generator) -> slice:
-            first = low + int(rng.integers(max(1, high - low - count + 1)))
-            return slice(first, first + count)
+        def run(low: int, high: int) -> slice:
+            first = low + int(rng.integers(max(1, high - low - points // 2 + 1)))
+            return slice(first, first + points // 2)
 
         n = file.get_slice("distance").get_shape()[0]
-        runs = [run("points", points // 2, 0, n // 2, rng), run("points", points // 2, n // 2, n, rng)]
-        volume = torch.cat([file.get_slice("points")[r] for r in runs]).float()
-        distance = torch.cat([file.get_slice("distance")[r] for r in runs]).float()
-        s = run("surface", points // 2, 0, file.get_slice("material").get_shape()[0], rng)
+        runs = [run(0, n // 2), run(n // 2, n)]
+        volume, distance = (torch.cat([file.get_slice(k)[r] for r in runs]).float() for k in ("points", "distance"))
+        s = run(0, file.get_slice("material").get_shape()[0])
         surface, material = file.get_slice("surface")[s].float(), file.get_slice("material")[s].float() / 255
         visible = file.get_slice("visible")[s][:, chosen].float()
         plane = None
@@ -155,7 +168,9 @@ def load_sample(
         images, of_pixels, normal, depth, valid = (t.flip(2) for t in (images, of_pixels, normal, depth, valid))
         intrinsics = intrinsics.clone()
         intrinsics[:, 2] = images.shape[2] - intrinsics[:, 2]
-    scale, shift = draw_placement(rng) if augment else (1.0, np.zeros(3))
+    scale, shift = 1.0, np.zeros(3)
+    if augment and rng.random() <= PLACEMENT_PROBABILITY:  # the visual hull is larger
+        scale, shift = float(np.exp(-abs(rng.normal(0, SCALE_SIGMA)))), rng.normal(0, SHIFT_SIGMA, 3)
     moved = torch.as_tensor(shift, dtype=torch.float32, device=device)
     volume, distance, depth = scale * volume + moved, scale * distance, scale * depth
     surface[:, 0] = scale * surface[:, 0] + moved
@@ -165,23 +180,17 @@ def load_sample(
     if mirrored:
         c2w[:, :, 0] *= -1  # the camera stays right-handed, its image is flipped
     if augment and rng.random() > UNCHANGED_PROBABILITY:
-        channels = torch.as_tensor(rng.permutation(3), device=device)
-        images = torch.cat([images[..., channels], images[..., 3:]], -1)
-        light, material = light[..., channels], torch.cat([material[:, channels], material[:, 3:]], -1)
-        of_pixels = torch.cat([of_pixels[..., channels], of_pixels[..., 3:]], -1)
+        images, light, material, of_pixels = permuted(rng, images, light, material, of_pixels)
     color, masks = images[..., :3], images[..., 3]
     if augment:
         tone = float(np.exp(TONE_SIGMA * rng.normal())) if rng.random() < TONE_PROBABILITY else 1.0
-        color = color**tone
-        source = torch.Generator(device).manual_seed(int(rng.integers(1 << 62)))
-        noise = torch.randn(color.shape, generator=source, device=device)
-        color = (color + float(rng.random()) * MAX_NOISE * noise).clamp(0, 1)
+        color = with_noise(color**tone, rng)
     mirrors = Camera(c2w[:0], intrinsics[:0], *masks.shape[:0:-1])
     if plane is not None:
         plane = plane[0], scale * plane[1] + float(np.dot(plane[0], shift))
         axis = turn @ torch.as_tensor(plane[0], dtype=torch.float32, device=device)
         mirrors = MirrorPlane(axis, plane[1]).mirrored(Camera(c2w, intrinsics, *masks.shape[:0:-1]))
-    origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # depth of the world's origin
+    origin = depth_of_origin(c2w)[:, None, None]
     return Sample(
         images=color.contiguous(),
         masks=masks.contiguous(),
@@ -203,13 +212,6 @@ def load_sample(
         mirrored_c2w=mirrors.c2w,
         mirrored_intrinsics=mirrors.intrinsics,
     )
-
-
-def draw_placement(rng: np.random.Generator) -> tuple[float, np.ndarray]:
-    """Random scale and shift ``(3,)``: objects are normalized by their visual hull, which is larger."""
-    if rng.random() > PLACEMENT_PROBABILITY:
-        return 1.0, np.zeros(3)
-    return float(np.exp(-abs(rng.normal(0, SCALE_SIGMA)))), rng.normal(0, SHIFT_SIGMA, 3)
 
 
 def draw_samples(

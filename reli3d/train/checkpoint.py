@@ -18,14 +18,6 @@ from reli3d.train.stage import Stage
 REMEDY = "name another output folder, and this file by --weights"
 
 
-def update_average(average: dict[str, Tensor], model: nn.Module, decay: float) -> None:
-    """Exponential moving average: ``average = decay * average + (1 - decay) * parameters``, in place."""
-    with torch.no_grad():
-        for key, value in model.state_dict().items():
-            if value.is_floating_point():
-                average[key].lerp_(value, 1 - decay)
-
-
 def save(
     folder: Path,
     stage: Stage,

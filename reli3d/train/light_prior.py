@@ -67,7 +67,8 @@ class LightPriorStage(Stage):
         """maps: ``.npz``.  added: number of blends that are added to the maps."""
         own = scale_free(training_maps(maps))
         every = torch.cat([own, scale_free(blends(own, added, np.random.default_rng(seed)))])
-        self.seed, self.model, self._numbers = seed, LightPrior(preset, len(every)), {"maps": str(maps), "added": added}
+        self.seed, self.model = seed, LightPrior(preset, len(every))
+        self.configuration = {"maps": str(maps), "added": added}
         self.texels, self.directions = every.flatten(1, 2), reni_frame(lat_long_directions(ROWS)).reshape(-1, 3)
         self.area = torch.sin((torch.arange(ROWS) + 0.5) * torch.pi / ROWS).repeat_interleave(2 * ROWS)
 
@@ -90,6 +91,3 @@ class LightPriorStage(Stage):
 
     def rate_factor(self, parameter: str) -> float:
         return 1.0 if parameter == "latents" else 0.1
-
-    def configuration(self) -> dict[str, Any]:
-        return self._numbers

@@ -1,11 +1,9 @@
-"""The log of a training run, and TensorBoard event files."""
+"""The log of a training run, and TensorBoard's writer."""
 
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from reli3d.errors import InputError
 
@@ -28,13 +26,11 @@ class Log:
             kept.append(line)
         path.write_text("".join(f"{line}\n" for line in kept))
         self._file = open(path, "a", buffering=1)  # noqa: SIM115 - open for the whole run
+        self.close = self._file.close
         self.write({"step": step, "config": configuration})
 
     def write(self, row: Mapping[str, Any]) -> None:
         self._file.write(json.dumps(row) + "\n")
-
-    def close(self) -> None:
-        self._file.close()
 
 
 def summary_writer() -> type:
@@ -46,24 +42,3 @@ def summary_writer() -> type:
             "--tensorboard", "expected the package tensorboard, got none; pip install tensorboard"
         ) from None
     return SummaryWriter
-
-
-class Board:
-    """A TensorBoard event file in ``folder``.  step: at which the run resumes; events of later steps are purged."""
-
-    def __init__(self, folder: str, step: int):
-        self._writer = summary_writer()(folder, purge_step=step + 1)
-
-    def numbers(self, row: Mapping[str, float]) -> None:
-        """The values of a row of the log, each by its name, at the row's ``step``."""
-        for name, value in row.items():
-            if name != "step":
-                self._writer.add_scalar(name, value, row["step"])
-
-    def image(self, image: np.ndarray, step: int) -> None:
-        """``image (H, W, 3)`` uint8 under the name ``validation``; flushes the file."""
-        self._writer.add_image("validation", image, step, dataformats="HWC")
-        self._writer.flush()
-
-    def close(self) -> None:
-        self._writer.close()

@@ -21,7 +21,7 @@ from tqdm import tqdm
 from reli3d.errors import InputError
 from reli3d.io.images import write_png
 from reli3d.train import checkpoint
-from reli3d.train.log import Board, Log
+from reli3d.train.log import Log, summary_writer
 from reli3d.train.stage import Options, Stage
 from reli3d.train.workers import Workers
 
@@ -77,6 +77,14 @@ def row_of(stage: Stage, sums: Tensor) -> dict[str, float]:
     return {"loss": round(float(sums[-2] / sums[-1]), 6), **means}
 
 
+@torch.no_grad()
+def update_average(average: dict[str, Tensor], model: nn.Module, decay: float) -> None:
+    """Exponential moving average: ``average = decay * average + (1 - decay) * parameters``, in place."""
+    for key, value in model.state_dict().items():
+        if value.is_floating_point():
+            average[key].lerp_(value, 1 - decay)
+
+
 def train(stage: Stage, options: Options, workers: Workers | None = None) -> None:
     """Trains ``stage.model`` in place to the end of the schedule; resumes from ``output/state.pt`` if it exists.
 
@@ -103,9 +111,9 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
         optimizer.load_state_dict(state["optimizer"])
         state.clear()
     measures = stage.measures()
-    about = {"stage": stage.name, "processes": workers.count, **asdict(options), **stage.configuration()}
+    about = {"stage": stage.name, "processes": workers.count, **asdict(options), **stage.configuration}
     log = Log(folder / "log.jsonl", step, about) if first else None
-    board = Board(options.tensorboard, step) if first and options.tensorboard else None
+    board = summary_writer()(options.tensorboard, purge_step=step + 1) if first and options.tensorboard else None
     began, bad = time.monotonic() - seconds, 0
     sums = torch.zeros(2 * len(stage.weights) + 2, dtype=torch.float64)
     if step == 0 and first:
@@ -129,20 +137,21 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
                 f"gradients: expected finite ones, got none in {bad} steps; the last checkpoint is "
                 f"{folder / 'state.pt'}"
             )
-        checkpoint.update_average(average, model, min(options.average, (1 + step) / (10 + step)))
+        update_average(average, model, min(options.average, (1 + step) / (10 + step)))
         step, seconds, sums = step + 1, float(values[-1]), sums + values[:-1]
         bar.set_description(f"{stage.name}, step {step}", refresh=False)
         bar.update(100 * progress(options, step, seconds) - bar.n)
         last = progress(options, step, seconds) >= 1.0
         saving = step % options.save_every == 0 or last
         if step % options.log_every == 0 or saving:
-            row = {"step": step, "seconds": round(seconds), **row_of(stage, sums)}
+            row = {"seconds": round(seconds), **row_of(stage, sums)}
             row |= {"rate": rate, "norm": round(float(norm), 5), "bad": bad}
             sums = torch.zeros_like(sums)
             if log:
-                log.write(row)
+                log.write({"step": step, **row})
             if board:
-                board.numbers(row)
+                for name, value in row.items():
+                    board.add_scalar(name, value, step)
         if saving:
             measures = stage.measures()
             if log:
@@ -151,7 +160,8 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
                 if image is not None:
                     write_png(folder / "validation.png", image)
                     if board:
-                        board.image(image, step)
+                        board.add_image("validation", image, step, dataformats="HWC")
+                        board.flush()
                 found = "".join(f", {name} {value:.4g}" for name, value in measures.items())
                 tqdm.write(f"{stage.name}: step {step}, {seconds:.0f} s, loss {row['loss']:.4g}{found}", sys.stderr)
     bar.close()

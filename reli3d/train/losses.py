@@ -35,8 +35,6 @@ GRADIENT_POINTS, GRADIENT_STEP = 384, 0.012  # surface points with a gradient lo
 PATTERN_FLOOR = 0.002  # mean squared error added to that of a pattern: 27 dB
 DEPTH_UNIT = 0.1  # of the object's longest side
 NORMALS = 192  # directions at which the irradiance is compared
-
-
 PIXEL_TERMS = tuple(name for name in WEIGHTS if name.startswith("pixel"))
 
 
@@ -163,12 +161,12 @@ def _finish(pixels: PixelMaps, views: TrainingViews) -> dict[str, Tensor]:
     valid = views.view_valid & views.finish_known[:, None, None]
     if not bool(valid.any()):
         return {}
-    target, found = views.view_material[valid][:, 3:], {}
-    for k, name in enumerate(("roughness", "metallic")):
-        low = ROUGHNESS_MIN if name == "roughness" else 0.0  # of the range of the network's values
-        wanted = ((target[:, k] - low) / (1.0 - low)).clamp(min=0.0)
-        found[f"pixel_{name}"] = excess_entropy(getattr(pixels, name)[valid][:, 0].sigmoid(), wanted)
-    return found
+    rough, metal = views.view_material[valid][:, 3:].unbind(1)
+    rough = ((rough - ROUGHNESS_MIN) / (1.0 - ROUGHNESS_MIN)).clamp(min=0.0)  # the range of the network's values
+    return {
+        "pixel_roughness": excess_entropy(pixels.roughness[valid][:, 0].sigmoid(), rough),
+        "pixel_metallic": excess_entropy(pixels.metallic[valid][:, 0].sigmoid(), metal),
+    }
 
 
 def _light_terms(field: LocalField, sample: Sample) -> dict[str, Tensor]:

@@ -35,10 +35,7 @@ class Muon(torch.optim.AdamW):
 
     @torch.no_grad()
     def step(self, closure=None):
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
+        """closure: None; gradients are there already."""
         for group in self.param_groups:
             for parameter in group["params"] if group.get("times", 1.0) <= MAX_TIMES else ():
                 gradient = parameter.grad
@@ -55,5 +52,4 @@ class Muon(torch.optim.AdamW):
                 parameter.mul_(1 - group["lr"] * group["weight_decay"])
                 parameter.add_(update.view_as(parameter), alpha=-group["lr"] * scale)
                 parameter.grad = None  # AdamW skips it
-        super().step()
-        return loss
+        return super().step(closure)

@@ -18,8 +18,15 @@ from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import mask_distance
 from reli3d.nn.local import QUARTER, LocalReconstructor, PixelMaps, mean_logit, pixel_colors
 from reli3d.nn.presets import LocalPreset
-from reli3d.nn.pyramid import ImagePyramid, pixel_hull_depths, pixel_positions
-from reli3d.train.batches import MAX_NOISE, UNCHANGED_PROBABILITY, TrainingViews, finish_known, valid_means
+from reli3d.nn.pyramid import ImagePyramid, depth_of_origin, pixel_hull_depths, pixel_positions
+from reli3d.train.batches import (
+    UNCHANGED_PROBABILITY,
+    TrainingViews,
+    finish_known,
+    permuted,
+    valid_means,
+    with_noise,
+)
 
 FULL_SIDE = 256  # pixels of an image at the finest level
 CACHE_BYTES = 1 << 31  # of small images in the memory of a process
@@ -92,13 +99,6 @@ def predict_pixels(model: LocalReconstructor, group: Group) -> tuple[PixelMaps, 
     return PixelMaps.of(raw, span, half, mean), color
 
 
-def reduction(path: Path, finest: int) -> int:
-    """Integer factor that reduces the views of a sample to about ``FULL_SIDE >> finest`` pixels, not fewer."""
-    with safe_open(path, "pt") as file:
-        size = file.get_slice("images").get_shape()[1]
-    return max(1, (size << finest) // FULL_SIDE)
-
-
 def read_views_reduced(path: Path, factor: int, device: torch.device | str = "cpu") -> TrainingViews:
     """All views of a sample, reduced by ``factor``, on ``device``."""
     with safe_open(path, "pt", device=str(device)) as file:
@@ -107,7 +107,7 @@ def read_views_reduced(path: Path, factor: int, device: torch.device | str = "cp
         known = finish_known(file)
     images = functional.avg_pool2d(images.permute(0, 3, 1, 2) / 255, factor).permute(0, 2, 3, 1).contiguous()
     valid = depth > 0
-    origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # depth of the world's origin
+    origin = depth_of_origin(c2w)[:, None, None]
     masks = images[..., 3].contiguous()
     return TrainingViews(
         images=images[..., :3].contiguous(),
@@ -139,25 +139,23 @@ def augmented(views: TrainingViews, rng: np.random.Generator) -> TrainingViews:
         changed = {"c2w": c2w, "intrinsics": intrinsics, "view_normal": views.view_normal * flip}
     color, material = views.images, views.view_material
     if rng.random() > UNCHANGED_PROBABILITY:
-        channels = torch.as_tensor(rng.permutation(3), device=device)
-        color, material = color[..., channels], torch.cat([material[..., channels], material[..., 3:]], -1)
-    source = torch.Generator(device).manual_seed(int(rng.integers(1 << 62)))
-    noise = torch.randn(color.shape, generator=source, device=device)
-    color = (color + float(rng.random()) * MAX_NOISE * noise).clamp(0, 1).contiguous()
+        color, material = permuted(rng, color, material)
+    color = with_noise(color, rng).contiguous()
     return replace(views, images=color, view_material=material.contiguous(), **changed)
 
 
 class ViewCache:
-    """Views of samples at the resolution of level ``finest``, on ``device``; caches up to CACHE_BYTES."""
+    """Views of samples at about ``FULL_SIDE >> finest`` pixels, not fewer, on ``device``; caches up to CACHE_BYTES."""
 
     def __init__(self, finest: int, device: torch.device | str = "cpu"):
-        self.device = device
-        self.finest, self._kept, self._bytes = finest, dict[Path, TrainingViews](), 0
+        self.finest, self.device, self._kept, self._bytes = finest, device, dict[Path, TrainingViews](), 0
 
     def __getitem__(self, path: Path) -> TrainingViews:
         if path in self._kept:
             return self._kept[path]
-        views = read_views_reduced(path, reduction(path, self.finest), self.device)
+        with safe_open(path, "pt") as file:
+            size = file.get_slice("images").get_shape()[1]
+        views = read_views_reduced(path, max(1, (size << self.finest) // FULL_SIDE), self.device)
         if self._bytes < CACHE_BYTES:
             self._kept[path] = views
             self._bytes += sum(getattr(views, f.name).nbytes for f in fields(views))

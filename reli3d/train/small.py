@@ -1,6 +1,7 @@
 """The training stages of the small network: ``pixels`` trains the 2D U-Net alone, ``small`` the whole network."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -69,17 +70,12 @@ class SmallStage(Stage):
         """folders: of ``*.safetensors`` from ``reli3d-data``.  maps: environment maps, .npz, for relighting samples.
         validation: folder of held-out samples.  Samples are loaded to the device of ``model``.
         """
-        self.model, self.folders, self.seed = model, tuple(folders), seed
-        self.max_views, self.points, self.pyramid_rate = options.max_views, options.points, options.pyramid_rate
+        self.model, self.folders, self.seed, self.given = model, tuple(folders), seed, options
         self.lights = training_maps(maps) if maps else None
         self.held_out = sorted(validation.glob("*.safetensors"))[:VALIDATION_OBJECTS] if validation else []
         self._files: list[Path] = []
-        self._numbers = {
-            "folders": [str(f) for f in folders],
-            **asdict(options),
-            "maps": str(maps or ""),
-            "validation": str(validation or ""),
-        }
+        paths = {"maps": str(maps or ""), "validation": str(validation or "")}
+        self.configuration = {"folders": [str(f) for f in folders], **asdict(options), **paths}
         model.to_compute(torch.bfloat16 if options.bfloat16 else torch.float32)
 
     def files(self, step: int) -> list[Path]:
@@ -92,7 +88,7 @@ class SmallStage(Stage):
 
     def batch(self, step: int, objects: range) -> Sequence[Any]:
         seeds = [(self.seed, step, k) for k in objects]
-        numbers = {"points": self.points, "max_views": self.max_views}
+        numbers = {"points": self.given.points, "max_views": self.given.max_views}
         return draw_samples(self.files(step), seeds, lights=self.lights, device=self.model.device, **numbers)
 
     def losses(self, item: Any) -> dict[str, Tensor]:  # a Sample
@@ -100,10 +96,7 @@ class SmallStage(Stage):
 
     def rate_factor(self, parameter: str) -> float:
         last = FAST_RATE if parameter.startswith(FAST_PARAMETERS) else 1.0
-        return last * (self.pyramid_rate if is_pixel_parameter(parameter) else 1.0)
-
-    def configuration(self) -> dict[str, Any]:
-        return self._numbers
+        return last * (self.given.pyramid_rate if is_pixel_parameter(parameter) else 1.0)
 
     def validation(self, average: dict[str, Tensor]) -> np.ndarray | None:
         """Previews of held-out samples, reconstructed from one and four views; None if none has a surface."""
@@ -111,16 +104,13 @@ class SmallStage(Stage):
             return None
         model = LocalReconstructor(self.model.preset)
         model.load_state_dict(average)
-        rows = []
+        rows, options = [], ReconstructOptions(texture_size=256)
         for path in self.held_out:
             sample, row = load_file(path), []
             for count in (1, 4):
-                try:
-                    options = ReconstructOptions(texture_size=256)
+                with suppress(NoSurface):  # early in training
                     asset = reconstruct(stored_views(sample, count), weights=model.eval(), options=options)
                     row.append(preview(asset, stored_views(sample, 4))())
-                except NoSurface:  # early in training
-                    continue
             if row:
                 rows.append(np.concatenate(row, 1))
         width = max((row.shape[1] for row in rows), default=0)
@@ -141,7 +131,7 @@ class PixelStage(SmallStage):
     def batch(self, step: int, objects: range) -> Sequence[Any]:
         """A single item with all objects: convolutions of small images are faster in large batches."""
         seeds = [(self.seed, step, k) for k in objects]
-        return [draw_group(self.files(step), seeds, self._cache, max_views=self.max_views)]
+        return [draw_group(self.files(step), seeds, self._cache, max_views=self.given.max_views)]
 
     def losses(self, item: Any) -> dict[str, Tensor]:  # a Group
         return pixel_losses(self.model, item)

@@ -35,13 +35,14 @@ class Options:
 class Stage(ABC):
     """A model with its batches and losses, trained by :func:`reli3d.train.loop.train`.
 
-    A subclass sets the four attributes and implements ``batch`` and ``losses``.
+    A subclass sets the first four attributes and implements ``batch`` and ``losses``.
     """
 
     name: str
     model: Any  # torch.nn.Module with ``preset``
     weights: Mapping[str, float]  # of the terms of ``losses``
     settings: Mapping[str, Any]  # defaults of :class:`Options` for this stage
+    configuration: Mapping[str, Any] = {}  # logged with a run in addition to its Options
     optimizer: type[torch.optim.AdamW] = torch.optim.AdamW
 
     @abstractmethod
@@ -69,10 +70,6 @@ class Stage(ABC):
     def validation(self, average: dict[str, Tensor]) -> np.ndarray | None:
         """Image ``(H, W, 3)`` uint8 of reconstructions by the averaged weights, or None."""
         return None
-
-    def configuration(self) -> dict[str, Any]:
-        """Values that are logged with a run in addition to :class:`Options`."""
-        return {}
 
     def options(self, output: str, **given: Any) -> Options:
         """Options with the defaults of the stage, overridden by ``given``."""

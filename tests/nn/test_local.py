@@ -69,8 +69,7 @@ def turned(c2w: torch.Tensor, yaw: float) -> torch.Tensor:
 
 def encoded(model, images, masks, c2w, intrinsics, *, inference=False):
     detail = torch.cat([images, mask_distance(masks)[..., None]], -1).contiguous()
-    encode = model.encode_for_inference if inference else model.encode
-    return encode(images, masks, c2w, intrinsics, detail, intrinsics)
+    return model.encode(images, masks, c2w, intrinsics, detail, intrinsics, inference=inference)
 
 
 def surface_of_ball(n: int = 200):

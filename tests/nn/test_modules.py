@@ -6,15 +6,20 @@ import torch
 
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.nn import transformer
-from reli3d.nn.camera import CameraEmbedder, camera_vector
 from reli3d.nn.heads import HEADS, Heads, WeightMerger
 from reli3d.nn.illumination import Illumination, Transformer1D
 from reli3d.nn.presets import BackboneSizes, EncoderSizes, IlluminationSizes, UpsamplerSizes
 from reli3d.nn.published import our_key
 from reli3d.nn.reni import rotation_from_6d
-from reli3d.nn.tokenizers import ImageTokenizer, patch_grid, resample_positions
+from reli3d.nn.tokenizers import (
+    CameraEmbedder,
+    ImageTokenizer,
+    PixelShuffleUpsampler,
+    camera_vector,
+    patch_grid,
+    resample_positions,
+)
 from reli3d.nn.transformer import TwoStreamTransformer
-from reli3d.nn.upsample import PixelShuffleUpsampler
 
 SHALLOW = dict(rtol=1e-5, atol=1e-5)  # one to four float32 layers with sums of at most a few hundred terms
 # blocks of attention and norms; the goldens differ by about 1e-5 of the largest value
@@ -50,14 +55,6 @@ def assert_relative(got, expected, bound):
     assert error < bound, f"relative error {error:.2e}, bound {bound:.0e}"
 
 
-@torch.no_grad()
-def test_camera_embedding_matches_published(golden):
-    g = golden("camera_embedder")
-    module = g.load(CameraEmbedder(64), "preprocessor.1.", "camera.")
-    numbers = torch.cat([g["c2w"].flatten(-2), g["intrinsics_normed"].flatten(-2)], dim=-1)
-    torch.testing.assert_close(module(numbers), g["out"], **SHALLOW)
-
-
 def test_camera_vector_holds_both_matrices_row_by_row():
     c2w = torch.arange(16.0).reshape(1, 1, 4, 4)
     vector = camera_vector(c2w, torch.tensor([[[512.0, 256.0, 250.0, 260.0]]]), 500)[0, 0]
@@ -66,50 +63,7 @@ def test_camera_vector_holds_both_matrices_row_by_row():
 
 
 DINO = EncoderSizes(hidden=48, layers=2, heads=3, patch=14, grid=7, mask_channel=False)
-
-
-@torch.no_grad()
-def test_image_tokens_match_published(golden):
-    g = golden("dinov2_tokenizer_small")
-    module = g.load(ImageTokenizer(DINO, 48), "tokenizer.0.", "encoder.")
-    tokens = module(g["image"], g["camera_embedding"])
-    assert_relative(tokens, g["out"], 1e-5)
-    assert patch_grid(tokens).shape == (1, 2, 5, 5, 48)
-    torch.testing.assert_close(patch_grid(tokens)[0, 1, 2, 3], tokens[0, 1, 1 + 2 * 5 + 3])
-
-
-@torch.no_grad()
-def test_position_resampling_uses_the_published_factor(golden):
-    g = golden("dinov2_pos_resample_512")
-    torch.testing.assert_close(resample_positions(g["position_embeddings"], 36, 36), g["out"], **SHALLOW)
-    same = resample_positions(g["position_embeddings"], 37, 37)
-    assert same is g["position_embeddings"]
-
-
-@torch.no_grad()
-def test_two_streams_match_published(golden):
-    g = golden("two_stream_small")
-    sizes = BackboneSizes(heads=4, latents=12, blocks=3, basic_blocks=2, experts=3, experts_from=1, groups=8)
-    module = g.load(TwoStreamTransformer(sizes, 32), "backbone.", "backbone.")
-    logits = []
-    router = module.main_blocks[1].transformer_block[0].ff.routing_network
-    router.register_forward_hook(lambda _module, _inputs, output: logits.append(output))
-    out = module(g["input"].squeeze(1), g["cross"])
-    assert_relative(out, g["out"].squeeze(1), 1e-5)
-    assert_relative(logits[0], g["router_logits_block1_basic0"], 1e-5)
-    shared = module(g["input"][:1].squeeze(1), g["cross"])  # one bank for the whole batch: the same as repeating it
-    repeated = module(g["input"][:1].squeeze(1).repeat(2, 1, 1), g["cross"])
-    torch.testing.assert_close(shared, repeated, **SHALLOW)
-
-
-@torch.no_grad()
-def test_feed_forward_in_chunks_is_the_same(golden, monkeypatch):
-    g = golden("two_stream_small")
-    sizes = BackboneSizes(heads=4, latents=12, blocks=3, basic_blocks=2, experts=3, experts_from=1, groups=8)
-    module = g.load(TwoStreamTransformer(sizes, 32), "backbone.", "backbone.")
-    monkeypatch.setattr(transformer, "CHUNK_NUMBERS", 5 * 2 * 4 * 32)  # five tokens of 32 numbers at a time
-    monkeypatch.setattr(transformer, "CONFLICT", 32)
-    assert_relative(module(g["input"].squeeze(1), g["cross"]), g["out"].squeeze(1), 1e-5)
+STREAMS = BackboneSizes(heads=4, latents=12, blocks=3, basic_blocks=2, experts=3, experts_from=1, groups=8)
 
 
 def illumination_sizes(**changes):
@@ -118,12 +72,62 @@ def illumination_sizes(**changes):
     return IlluminationSizes(**{**values, **changes})
 
 
+def two_streams(g):
+    return g.load(TwoStreamTransformer(STREAMS, 32), "backbone.", "backbone.")
+
+
+CASES = {  # module, fronts of its published and our names, inputs, shape of the output
+    "camera_embedder": (lambda: CameraEmbedder(64), "preprocessor.1.", "camera.", lambda g: [numbers_of(g)]),
+    "dinov2_tokenizer_small": (
+        lambda: ImageTokenizer(DINO, 48), "tokenizer.0.", "encoder.", lambda g: [g["image"], g["camera_embedding"]],
+    ),
+    "transformer1d_small": (
+        lambda: Transformer1D(illumination_sizes(layers=3)), "postprocessor.1.backbone.", "illumination.transformer.",
+        lambda g: [g["input"], g["cross"]],
+    ),
+    "pixel_shuffle_small": (
+        lambda: PixelShuffleUpsampler(UpsamplerSizes(convolutions=4, scale=4, channels=5), 16),
+        "postprocessor.0.", "upsampler.", lambda g: [g["triplane"]],
+    ),
+}  # fmt: skip
+
+
+def numbers_of(g):
+    return torch.cat([g["c2w"].flatten(-2), g["intrinsics_normed"].flatten(-2)], dim=-1)
+
+
+@pytest.mark.parametrize("name", CASES)
 @torch.no_grad()
-def test_token_transformer_matches_published(golden):
-    g = golden("transformer1d_small")
-    module = Transformer1D(illumination_sizes(layers=3))
-    g.load(module, "postprocessor.1.backbone.", "illumination.transformer.")
-    assert_relative(module(g["input"], g["cross"]), g["out"], 1e-5)
+def test_modules_match_published(golden, name):
+    g, (make, published, ours, inputs) = golden(name), CASES[name]
+    bound = 1e-6 if name == "camera_embedder" else 1e-5  # one affine map of 25 numbers
+    assert_relative(g.load(make(), published, ours)(*inputs(g)), g["out"], bound)
+
+
+def test_patches_are_between_the_class_and_the_camera():
+    tokens = torch.arange(2 * 27.0).view(1, 2, 27, 1)
+    assert patch_grid(tokens).shape == (1, 2, 5, 5, 1)
+    assert patch_grid(tokens)[0, 1, 2, 3] == tokens[0, 1, 1 + 2 * 5 + 3]
+
+
+@torch.no_grad()
+def test_position_resampling_uses_the_published_factor(golden):
+    g = golden("dinov2_pos_resample_512")
+    torch.testing.assert_close(resample_positions(g["position_embeddings"], 36, 36), g["out"], **SHALLOW)
+    assert resample_positions(g["position_embeddings"], 37, 37) is g["position_embeddings"]
+
+
+@torch.no_grad()
+def test_two_streams_match_published_also_in_chunks(golden, monkeypatch):
+    g = golden("two_stream_small")
+    module, logits = two_streams(g), []
+    router = module.main_blocks[1].transformer_block[0].ff.routing_network
+    router.register_forward_hook(lambda _module, _inputs, output: logits.append(output))
+    assert_relative(module(g["input"].squeeze(1), g["cross"]), g["out"].squeeze(1), 1e-5)
+    assert_relative(logits[0], g["router_logits_block1_basic0"], 1e-5)
+    monkeypatch.setattr(transformer, "CHUNK_NUMBERS", 5 * 2 * 4 * 32)  # five tokens of 32 numbers at a time
+    monkeypatch.setattr(transformer, "CONFLICT", 32)
+    assert_relative(module(g["input"].squeeze(1), g["cross"]), g["out"].squeeze(1), 1e-5)
 
 
 @torch.no_grad()
@@ -135,14 +139,6 @@ def test_illumination_path_matches_published(golden):
     assert_relative(latent, g["reni_latent"], 1e-5)
     torch.testing.assert_close(rotation, g["rotation"], **DEEP)
     torch.testing.assert_close(strength, g["strength"].squeeze(1), **DEEP)
-
-
-@torch.no_grad()
-def test_upsampling_matches_published(golden):
-    g = golden("pixel_shuffle_small")
-    module = PixelShuffleUpsampler(UpsamplerSizes(convolutions=4, scale=4, channels=5), 16)
-    g.load(module, "postprocessor.0.", "upsampler.")
-    assert_relative(module(g["triplane"]), g["out"], 1e-5)
 
 
 def test_rotations_match_published_and_return(golden):
@@ -171,8 +167,8 @@ def published_heads(g):
 def test_heads_match_published(golden):
     g = golden("object_representation_heads")
     heads = published_heads(g)
-    for values in (heads(g["features"], list(HEADS)), heads.at(g["triplane"], g["positions"] / 0.87, list(HEADS))):
-        for name, value in values.items():
+    for features in (g["features"], sample_triplane(g["triplane"], g["positions"] / 0.87)):
+        for name, value in heads(features, list(HEADS)).items():
             shift = -1.0 if name == "density" else 0.0  # the published raw density has its bias added
             torch.testing.assert_close(value + shift, g["out." + PUBLISHED_HEADS.get(name, name)], **SHALLOW)
     with pytest.raises(ValueError, match="heads: expected some of density"):
@@ -212,13 +208,15 @@ def test_cube_weights_are_bounded_around_neutral():
         torch.testing.assert_close(weights.gamma, torch.full((2, 3), gamma), **SHALLOW)
 
 
-def test_gradients_of_a_shared_bank_are_those_of_its_copies_added_up(golden):
+def test_a_shared_bank_has_the_values_of_its_copies_and_their_gradients_added_up(golden):
     """The stem and the first keys and values are computed once for a batch; float64 copies are the reference."""
     g = golden("two_stream_small")
-    sizes = BackboneSizes(heads=4, latents=12, blocks=3, basic_blocks=2, experts=3, experts_from=1, groups=8)
-    module = g.load(TwoStreamTransformer(sizes, 32), "backbone.", "backbone.")
+    module = two_streams(g)
     bank, views = g["input"][:1].squeeze(1).requires_grad_(), g["cross"]
-    (shared,) = torch.autograd.grad(module(bank, views).square().sum(), bank)
+    got = module(bank, views)
+    (shared,) = torch.autograd.grad(got.square().sum(), bank)
     copies = bank.detach().double().repeat(2, 1, 1).requires_grad_()
-    (separate,) = torch.autograd.grad(module.double()(copies, views.double()).square().sum(), copies)
+    expected = module.double()(copies, views.double())
+    assert_relative(got.double(), expected, 1e-5)
+    (separate,) = torch.autograd.grad(expected.square().sum(), copies)
     assert_relative(shared.double(), separate.sum(0, keepdim=True), 1e-4)  # float32 backward through three blocks

@@ -120,7 +120,7 @@ def test_every_device_gives_the_same_material(device):
 def test_material_refuses_wrong_arguments():
     shape = make_object(505)
     points, normals, part = surface_points(shape, 10, 0)
-    with pytest.raises(TypeError, match="points: expected float32"):
+    with pytest.raises(TypeError, match="points: expected torch.float32"):
         material_at(shape, points.astype(np.float64), normals, part)
     with pytest.raises(ValueError, match="normals: expected shape"):
         material_at(shape, points, normals[:5], part)

@@ -18,8 +18,8 @@ from tests.support.stages import SEEDS
 class _Thin(LocalReconstructor):
     """Knows the shape of one object exactly, and draws it 1.5 units too thin."""
 
-    def encode_for_inference(self, *inputs, mirrored=0):
-        known = super().encode_for_inference(*inputs, mirrored=mirrored)
+    def encode(self, *inputs, **options):
+        known = super().encode(*inputs, **options)
         return _ThinField(*(getattr(known, f.name) for f in dataclasses.fields(known)))
 
 

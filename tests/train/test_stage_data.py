@@ -20,8 +20,7 @@ from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.config import StageConfig
 from reli3d.train.stages.latents import fitted
 from reli3d.train.stages.losses import gradients
-from reli3d.train.stages.shards import Shards, pack
-from reli3d.train.stages.sources import source
+from reli3d.train.stages.shards import Shards, pack, source
 from reli3d.train.stages.step import object_losses
 from reli3d.train.stages.views import Samples, draw
 from tests.support.stages import ball_model, write_samples

@@ -29,28 +29,20 @@ class Captures:
     """
 
     def __init__(self, folder: Path, size: int = SIZE):
-        self.size, self.rejected, self.folders = size, {}, []
-        candidates = sorted(p.parent for p in folder.glob("*/transforms.json"))
-        for one in candidates:
-            reason = unfit(one)
-            if reason:
-                self.rejected[one.name] = reason
-            else:
-                self.folders.append(one)
+        reasons = {p.parent: unfit(p.parent) for p in sorted(folder.glob("*/transforms.json"))}
+        self.folders = [one for one, reason in reasons.items() if reason is None]
+        self.rejected = {one.name: reason for one, reason in reasons.items() if reason}
         if not self.folders:
-            reasons = "; ".join(f"{k}: {v}" for k, v in list(self.rejected.items())[:3]) or "no */transforms.json"
-            raise InputError(folder, f"expected captures of good quality, got none ({reasons})")
-        self._prepared = lru_cache(CACHED_CAPTURES)(self._prepare)
+            why = "; ".join(f"{k}: {v}" for k, v in list(self.rejected.items())[:3]) or "no */transforms.json"
+            raise InputError(folder, f"expected captures of good quality, got none ({why})")
+        self._views = lru_cache(CACHED_CAPTURES)(lambda k: capture_views(load_views(self.folders[k], every=True), size))
 
     def __len__(self) -> int:
         return len(self.folders)
 
     def load(self, index: int, choose: Chooser) -> ObjectViews:
-        views = self._prepared(index)
+        views = self._views(index)
         return views.select(choose(len(views)))
-
-    def _prepare(self, index: int) -> ObjectViews:
-        return capture_views(load_views(self.folders[index], every=True), self.size)
 
 
 def unfit(folder: Path) -> str | None:

@@ -55,7 +55,10 @@ def fitted(
         with safe_open(cache, "pt") as file:
             if (file.metadata() or {}).get("decoder") == digest.hexdigest():
                 known = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no iterable
-    stored = {p.stem: _environment(p) for p in files}
+    stored = {}
+    for path in files:
+        with safe_open(path, "pt") as file:
+            stored[path.stem] = file.get_tensor("environment")
     keys = {stem: hashlib.sha256(light.numpy().tobytes()).hexdigest() for stem, light in stored.items()}
     missing = [stem for stem, key in keys.items() if f"{key}.latent" not in known]
     for done, stem in enumerate(missing):
@@ -69,8 +72,3 @@ def fitted(
         with replacing(cache) as temporary:
             save_file({k: v.contiguous() for k, v in known.items()}, temporary, {"decoder": digest.hexdigest()})
     return {stem: (known[f"{key}.latent"], known[f"{key}.strength"]) for stem, key in keys.items()}
-
-
-def _environment(path: Path) -> Tensor:
-    with safe_open(path, "pt") as file:
-        return file.get_tensor("environment")

@@ -3,6 +3,7 @@
 A term whose ground truth a sample lacks is absent from the result instead of zero.
 """
 
+import os
 from collections.abc import Callable
 
 import torch
@@ -58,13 +59,10 @@ def lpips_distance() -> Perceptual:
             "--perceptual", "expected the package lpips, got none; pip install lpips, or use --perceptual gradients"
         ) from None
     weights = torch.hub.get_dir() + "/checkpoints/vgg16-397923af.pth"
-    try:
-        with open(weights, "rb"):
-            pass
-    except OSError:
+    if not os.access(weights, os.R_OK):
         raise InputError(
             "--perceptual", f"expected the weights of VGG16 at {weights}, got none; use --perceptual gradients"
-        ) from None
+        )
     network = lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
 
     def distance(rendered: Tensor, observed: Tensor) -> Tensor:
@@ -74,27 +72,17 @@ def lpips_distance() -> Perceptual:
     return distance
 
 
-def perceptual(name: str) -> Perceptual:
-    """The image distance ``lpips`` or ``gradients``."""
-    return lpips_distance() if name == "lpips" else gradients
-
-
-def opacity_entropy(rendering: Rendering, target: ObjectViews, view: int) -> Tensor:
-    """Binary cross-entropy of opacity and mask, mean over the valid pixels."""
-    coverage = rendering.coverage.clamp(MIN_OPACITY, 1.0 - MIN_OPACITY)
-    entropy = binary_cross_entropy(coverage, target.masks[view], reduction="none")
-    return _mean(entropy, target, view)
-
-
-def coverage_error(rendering: Rendering, target: ObjectViews, view: int) -> Tensor:
-    """Mean squared error of antialiased coverage against the mask, over the valid pixels."""
-    return _mean((rendering.coverage - target.masks[view]).square(), target, view)
-
-
-def _mean(values: Tensor, target: ObjectViews, view: int) -> Tensor:
+def mask_error(rendering: Rendering, target: ObjectViews, view: int, *, volume: bool) -> Tensor:
+    """Mean over the valid pixels: cross-entropy of a volume's opacity, squared error of a surface's coverage."""
+    mask = target.masks[view]
+    if volume:
+        opacity = rendering.coverage.clamp(MIN_OPACITY, 1.0 - MIN_OPACITY)
+        error = binary_cross_entropy(opacity, mask, reduction="none")
+    else:
+        error = (rendering.coverage - mask).square()
     if target.valid is None:
-        return values.mean()
-    return (values * target.valid[view]).sum() / target.valid[view].sum().clamp(min=1.0)
+        return error.mean()
+    return (error * target.valid[view]).sum() / target.valid[view].sum().clamp(min=1.0)
 
 
 def map_terms(rendering: Rendering, target: ObjectViews, view: int) -> dict[str, Tensor]:

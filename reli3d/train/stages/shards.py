@@ -1,4 +1,4 @@
-"""Training objects in WebDataset tar files: one ``<object>.safetensors`` per object."""
+"""Folders of training objects, among them WebDataset tar files with one ``<object>.safetensors`` per object."""
 
 import tarfile
 from collections.abc import Callable, Iterable, Iterator
@@ -13,18 +13,10 @@ from torch import Tensor
 from reli3d.errors import InputError
 from reli3d.io.files import replacing
 from reli3d.train.stages.captures import Captures
-from reli3d.train.stages.views import Chooser, ObjectViews, Samples, sample_views
+from reli3d.train.stages.views import Chooser, ObjectViews, Samples, Source, sample_views
 
-STORED_TENSORS = (
-    "images",
-    "c2w",
-    "intrinsics",
-    "view_material",
-    "view_normal",
-    "view_depth",
-    "environment",
-    "finish_known",
-)
+OF_VIEWS = ("images", "c2w", "intrinsics", "view_material", "view_normal", "view_depth")
+STORED_TENSORS = (*OF_VIEWS, "environment", "finish_known")
 
 
 def to_tensors(views: ObjectViews) -> dict[str, Tensor]:
@@ -101,3 +93,14 @@ class Shards:
         except SafetensorError as error:
             raise InputError(path, f"expected a sample at byte {offset}, got a broken one ({error})") from None
         return replace(sample_views(stored.get, choose), background=bool(stored.get("background", True)))
+
+
+def source(folder: Path) -> Source:
+    """The objects of a folder of shards, samples or captures.  Raises InputError if it has none."""
+    if not folder.is_dir():
+        raise InputError(folder, "expected a folder of samples, captures or shards, got none")
+    if any(folder.glob("*.tar")):
+        return Shards(folder)
+    if any(folder.glob("*.safetensors")):
+        return Samples(folder)
+    return Captures(folder)

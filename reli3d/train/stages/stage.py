@@ -12,7 +12,7 @@ from reli3d.errors import InputError
 from reli3d.nn.model import Reconstructor
 from reli3d.train.stage import Stage
 from reli3d.train.stages.config import TINY, StageConfig
-from reli3d.train.stages.losses import perceptual
+from reli3d.train.stages.losses import gradients, lpips_distance
 from reli3d.train.stages.step import checkpointed, encode, object_losses, renderings
 from reli3d.train.stages.surface import surface
 from reli3d.train.stages.views import Draw, Source, draw
@@ -64,8 +64,8 @@ class PaperStage(Stage):
         self.settings |= {"final_rate": 0.1, "weight_decay": 0.01, "clip": 1.0}
         self.model, self.config, self.sources = model, config, sources
         self.seed, self.max_views, self.background = seed, options.max_views, options.background
-        self.bfloat16, self.distance = options.bfloat16, perceptual(options.distance)
-        self._numbers = {"config": asdict(config), "folders": list(folders), **asdict(options)}
+        self.bfloat16, self.distance = options.bfloat16, lpips_distance() if options.distance == "lpips" else gradients
+        self.configuration = {"config": asdict(config), "folders": list(folders), **asdict(options)}
         if options.checkpointing:
             checkpointed(model)
         held_out = [validation] * VALIDATION_OBJECTS if validation else []
@@ -89,9 +89,6 @@ class PaperStage(Stage):
 
     def losses(self, item: tuple[int, int]) -> dict[str, Tensor]:
         return object_losses(self.model, self.drawn(*item), self.config, self.distance, bfloat16=self.bfloat16)
-
-    def configuration(self) -> dict[str, Any]:
-        return self._numbers
 
     @torch.no_grad()
     def measures(self) -> dict[str, float]:

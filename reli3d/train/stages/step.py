@@ -1,15 +1,18 @@
 """The losses of one object in one stage."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from reli3d.fit.shading import DIFFUSE_MODEL
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.model import Code, Reconstructor
+from reli3d.nn.tokenizers import EncoderLayer
+from reli3d.nn.transformer import BasicBlock, FuseBlock
 from reli3d.render.environment import Environment
 from reli3d.render.gaussians import shade_gaussians
 from reli3d.render.points import SurfacePoints
@@ -20,6 +23,8 @@ from reli3d.train.stages.rendering import Rendering, lobes
 from reli3d.train.stages.surface import Shader, render_surface, seed_surface, surface
 from reli3d.train.stages.views import Draw
 from reli3d.train.stages.volume import occupied, render_volume
+
+CHECKPOINTED = (EncoderLayer, FuseBlock, BasicBlock)  # units of gradient checkpointing
 
 
 def encode(model: Reconstructor, drawn: Draw, *, bfloat16: bool = False) -> Code:
@@ -78,11 +83,10 @@ def object_losses(
     of_views: dict[str, list[Tensor]] = {}
     for view, rendering in enumerate(shown):
         rendered, observed = losses.compared_colors(rendering, target, view)
-        mask = losses.opacity_entropy if stage.renderer == "volume" else losses.coverage_error
         found = {
             "image": (rendered - observed).square().mean(),
             "perceptual": distance(rendered, observed),
-            "mask": mask(rendering, target, view),
+            "mask": losses.mask_error(rendering, target, view, volume=stage.renderer == "volume"),
             **losses.map_terms(rendering, target, view),
         }
         for name, value in found.items():
@@ -98,26 +102,8 @@ def total(terms: dict[str, Tensor], stage: StageConfig) -> Tensor:
     return sum((weights[name] * value for name, value in terms.items()), start=torch.zeros(()))
 
 
-def trunk_layers(model: Reconstructor) -> list[Any]:
-    """The layers of the encoders and transformers: the units of gradient checkpointing."""
-    layers: list[Any] = [
-        *model.encoder.model.encoder.layer,
-        *model.illumination.encoder.model.encoder.layer,
-        *model.illumination.transformer.transformer_blocks,
-    ]
-    blocks: Any = model.backbone.main_blocks
-    for block in blocks:
-        layers += [block.fuse_block_in, *list(block.transformer_block), block.fuse_block_out]
-    return layers
-
-
 def checkpointed(model: Reconstructor) -> None:
-    """Enables gradient checkpointing of the trunk's layers, in place."""
-    from torch.utils.checkpoint import checkpoint
-
-    for layer in trunk_layers(model):
-        layer.forward = _again(checkpoint, layer.forward)
-
-
-def _again(checkpoint: Callable, forward: Callable) -> Callable:
-    return lambda *inputs: checkpoint(forward, *inputs, use_reentrant=False)
+    """Enables gradient checkpointing of the layers of the encoders and transformers, in place."""
+    layers: list[Any] = [module for module in model.modules() if isinstance(module, CHECKPOINTED)]
+    for layer in layers:
+        layer.forward = partial(checkpoint, layer.forward, use_reentrant=False)

@@ -4,7 +4,7 @@ Missing ground truth is None and takes part in no loss.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -63,22 +63,18 @@ class ObjectViews(Movable):
         if self.shown is not None:
             known = self.shown[..., None]
             fraction = planes(known)
-            for name in ("material", "normal"):
-                value = getattr(self, name)
-                if value is not None:
-                    changed[name] = planes(value * known) / fraction.clamp(min=1e-3)
-            if "normal" in changed:
-                changed["normal"] = normalize(changed["normal"], dim=-1)
+            if self.material is not None:
+                changed["material"] = planes(self.material * known) / fraction.clamp(min=1e-3)
+            if self.normal is not None:
+                changed["normal"] = normalize(planes(self.normal * known) / fraction.clamp(min=1e-3), dim=-1)
             changed["shown"] = (fraction[..., 0] > 0.99).float()
         return replace(self, **changed)
 
     def window(self, x: int, y: int, side: int) -> "ObjectViews":
         """Crops of all views: a square of ``side`` pixels with its upper left corner at pixel ``(x, y)``."""
-        cut: dict[str, Any] = {}
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if isinstance(value, Tensor) and f.name in ("images", "masks", "valid", "material", "normal", "shown"):
-                cut[f.name] = value[:, y : y + side, x : x + side].contiguous()
+        maps = {name: getattr(self, name) for name in ("images", "masks", "valid", "material", "normal", "shown")}
+        rows, columns = slice(y, y + side), slice(x, x + side)
+        cut: dict[str, Any] = {k: v[:, rows, columns].contiguous() for k, v in maps.items() if v is not None}
         shift = self.intrinsics.new_tensor([0.0, 0.0, float(x), float(y)])
         return replace(self, intrinsics=self.intrinsics - shift, **cut)
 

@@ -5,7 +5,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reli3d.geometry.camera import Camera, camera_rays
-from reli3d.nn.heads import truncated_exp
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.render.bump import radial_bump
 from reli3d.render.color import srgb_to_linear
@@ -20,22 +19,16 @@ MIN_RAY_OPACITY = 1e-2  # of a ray; rays below it are not shaded
 GRADIENT_STEP = 0.02  # of the cube's half side: finite-difference step of the density gradient
 
 
-def density(model: Reconstructor, raw: Tensor) -> Tensor:
-    """Density per model unit from the raw outputs of the ``density`` head."""
-    return truncated_exp(raw + model.preset.density_bias)
-
-
 def occupied(model: Reconstructor, code: Code, stage: StageConfig) -> OccupancyGrid:
     """Occupancy grid of the cells that rays must sample; without gradient."""
     radius = model.preset.radius
     step = 2.0 * radius / stage.samples_along
 
     def field(points: Tensor) -> Tensor:
-        return density(model, model.query(code, points[None], ("density",))["density"][0, :, 0])
+        return model.density(model.query(code, points[None], ("density",))["density"][0, :, 0])
 
-    return OccupancyGrid.of_density(
-        field, stage.grid, radius, threshold=MIN_STEP_OPACITY / step, device=code.latent.device
-    )
+    threshold = MIN_STEP_OPACITY / step
+    return OccupancyGrid.of_density(field, stage.grid, radius, threshold=threshold, device=code.latent.device)
 
 
 def density_normals(model: Reconstructor, code: Code, points: Tensor) -> Tensor:
@@ -67,11 +60,9 @@ def render_volume(
     step = 2.0 * model.preset.radius / stage.samples_along
     shift = torch.rand(len(origins), generator=torch.Generator().manual_seed(seed)).clamp(max=0.999999)
     samples = march_rays(origins, directions, grid, step, shift=shift.to(origins.device))
-    raw = model.query(
-        code, samples.positions(origins, directions)[None], ("density", "base_color", "roughness", "metallic")
-    )
-    raw = {name: value[0] for name, value in raw.items()}
-    sigma = density(model, raw["density"][:, 0])
+    along, heads = samples.positions(origins, directions), ("density", "base_color", "roughness", "metallic")
+    raw = {name: value[0] for name, value in model.query(code, along[None], heads).items()}
+    sigma = model.density(raw["density"][:, 0])
     first = composite(sigma, raw["base_color"].contiguous(), samples)
     rest = torch.cat([raw["roughness"], raw["metallic"], torch.zeros_like(raw["metallic"])], -1)
     material = torch.cat([first.color, composite(sigma, rest, samples).color[:, :2]], -1)
