@@ -61,6 +61,24 @@ def test_backends_agree_on_a_million_ray_queries(device):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_not_finite_and_zero_rays_miss(device, backend):
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    scene = make(mesh.vertices, mesh.faces, backend, device)
+    inf, nan = float("inf"), float("nan")
+    o = torch.zeros(9, 3, device=device)
+    d = torch.ones(9, 3, device=device)
+    d[0, 0], d[1, 1], d[2, 2], o[3, 0], o[4, 1], o[5, 2] = nan, inf, -inf, nan, inf, -inf
+    d[6] = 0.0
+    d[7] = 1e-30
+    hits = scene.closest(o, d)
+    assert hits.face.tolist()[:7] == [-1] * 7 and hits.face.tolist()[7] >= 0 and hits.face.tolist()[8] >= 0
+    assert scene.occluded(o, d).tolist() == [False] * 7 + [True, True]
+    for far in (nan, -1.0, 0.0):
+        assert scene.closest(o[8:], d[8:], t_max=far).face.tolist() == [-1]
+        assert not bool(scene.occluded(o[8:], d[8:], t_max=far)[0])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_limits_shapes_and_refit(device, backend):
     square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     scene = make(square, [[0, 1, 2], [0, 2, 3]], backend, device)
@@ -98,6 +116,26 @@ def test_degenerate_meshes_are_data_and_broken_ones_are_named(device, backend):
         ValueError, match=r"origins, directions, t_max: .* that broadcast, got \(2, 3\), \(3, 3\), \(\)"
     ):
         scene.closest(o.expand(2, 3), d.expand(3, 3))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("scale, shift", [(1.0, 0.0), (1e-4, 0.0), (1e3, 0.0), (1.0, 50.0)])
+def test_offset_rays_do_not_hit_their_own_face(device, backend, scale, shift):
+    vertices, faces = soup(5, 400)
+    vertices = (vertices * scale + shift).astype(np.float32)
+    scene = make(vertices, faces, backend, device)
+    rng = np.random.default_rng(2)
+    n = 100_000
+    face = torch.tensor(rng.integers(0, len(faces), n), dtype=torch.int32, device=device)
+    b = rng.random((n, 2))
+    b = np.where(b.sum(1, keepdims=True) > 1, 1 - b, b)
+    bary = torch.tensor(b, dtype=torch.float32, device=device)
+    v, f = scene.vertices, scene.faces
+    position, ng = interpolate(v, f, face, bary), hit_normals(v, f, face)
+    d = torch.tensor(rng.normal(size=(n, 3)), dtype=torch.float32, device=device)
+    d = torch.nn.functional.normalize(d, dim=-1)
+    hits = scene.closest(offset_origin(position, ng, d, scene.scale), d)
+    assert int((hits.face == face).sum()) == 0
 
 
 def solved(a, b, c, o, d):

@@ -109,7 +109,16 @@ def test_one_inside_vertex_has_the_eight_dual_vertices_of_the_closed_form(device
     assert volume(mesh) == pytest.approx((2 * 0.8 / 12) ** 3, rel=1e-5)  # a cube of that half side
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("case", range(1, 255, 11))
+def test_one_cube_is_closed_at_the_box(device, case):
+    sdf = sign_pattern(case).contiguous().to(device)
+    mesh = extract_surface(sdf, radius=1.0, weights=CubeWeights(**random_weights(sdf.shape, case, device)))
+    found = report(mesh)
+    assert found.watertight and found.manifold, found
+    assert volume(mesh) > 0
+
+
+@pytest.mark.parametrize("seed", range(6))
 def test_noise_is_a_closed_manifold_with_the_inside_on_the_inner_side(device, seed):
     rng = torch.Generator().manual_seed(seed)
     sdf = torch.randn(9, 10, 12, generator=rng).to(device)  # all ambiguous cases, faces at the box too
@@ -205,9 +214,26 @@ def test_wrong_input_is_named(change, error, name):
         extract_surface(sdf, radius=radius, weights=CubeWeights(**arguments))
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_fields_and_weights_of_any_size_give_finite_vertices_and_gradients(device, seed):
+    rng = torch.Generator().manual_seed(seed)
+    shape = (12, 11, 10)
+    sdf = torch.randn(shape, generator=rng) * 10.0 ** torch.randint(-6, 7, shape, generator=rng)
+    sdf[torch.rand(shape, generator=rng) < 0.1] = 0.0
+    sdf[torch.rand(shape, generator=rng) < 0.1] = -0.0
+    cubes = 11 * 10 * 9
+    alpha, beta = (10.0 ** torch.randint(-3, 4, (cubes, n), generator=rng) for n in (8, 12))
+    leaves = [v.to(device).requires_grad_() for v in (sdf, alpha, beta)]
+    mesh = extract_surface(leaves[0], radius=1.0, weights=CubeWeights(alpha=leaves[1], beta=leaves[2]))
+    found = report(mesh.detach())
+    assert found.boundary_edges == 0 and float(mesh.vertices.detach().abs().max()) <= 1.0 + 1e-6  # rounding of a mean
+    grads = torch.autograd.grad(mesh.vertices.sum(), leaves)
+    assert all(bool(torch.isfinite(g).all()) for g in grads) and all(float(g.abs().max()) > 0 for g in grads)
+
+
 def test_gradients_behind_the_mesh_are_bitwise_identical_for_any_number_of_threads(threads):
     """Center vertices, deviation, normals, smoothing, atlas: torch's own scatters add up in any order."""
-    sdf = torus(28) + 0.01 * torch.randn(29, 29, 29, generator=torch.Generator().manual_seed(0))
+    sdf = torus(40) + 0.01 * torch.randn(41, 41, 41, generator=torch.Generator().manual_seed(0))
     weights = {"sdf": sdf, **random_weights(sdf.shape, 0, spread=0.5)}
     results = []
     for count in (1, 2, 5, 5):

@@ -123,7 +123,7 @@ def test_from_one_side_the_plane_is_ambiguous(count, arc):
 def test_a_plane_cuts_little_of_an_object_that_has_none(count, arc):
     """Random balls: few planes are found, and the mirrored hull leaves most of each object."""
     camera, planes, rng = around(count, arc), 0, torch.Generator().manual_seed(1)
-    for _ in range(4):
+    for _ in range(8):
         balls = [
             (
                 tuple((0.7 * torch.rand(3, generator=rng) - 0.35).tolist()),
@@ -140,7 +140,7 @@ def test_a_plane_cuts_little_of_an_object_that_has_none(count, arc):
             mirrored = points[inside] - 2 * ((points[inside] @ plane.normal) - plane.offset)[:, None] * plane.normal
             kept = hull_distance(mirrored, distance, camera) > -0.01
             assert float(kept.float().mean()) > 0.9
-    assert planes <= 2
+    assert planes <= 3
 
 
 def test_few_views_and_rolled_cameras_are_ambiguous():

@@ -9,10 +9,10 @@ from reli3d.render.material import eval_bsdf, pdf_lobes, sample_bsdf
 from reli3d.render.sampling import halton
 from tests.support.surfaces import lit, on_ball
 
-ROUGHNESS = np.linspace(0.05, 1.0, 5)
+ROUGHNESS = np.linspace(0.05, 1.0, 8)
 QUADRATURE = 2e-5  # change of the albedo by the last halving of its step
 ERROR = 3e-4  # standard error of a measured albedo: a third of the 1e-3 that it may exceed 1 by
-COSINES = np.linspace(0.05, 1.0, 5)
+COSINES = np.linspace(0.05, 1.0, 8)
 
 
 def directional_albedo(alpha, cos_o, side=1000):
@@ -35,7 +35,7 @@ def directional_albedo(alpha, cos_o, side=1000):
 
 
 def test_the_albedo_of_the_quadrature_has_converged():
-    for roughness, cos_o in ((0.05, 0.05), (1.0, 0.05)):
+    for roughness, cos_o in ((0.05, 0.05), (0.3, 0.05), (1.0, 0.05), (1.0, 1.0)):
         coarse, fine = (directional_albedo(roughness**2, cos_o, side) for side in (1000, 2000))
         assert abs(coarse - fine) < QUADRATURE
     assert abs(directional_albedo(1e-3, 1.0) - 1.0) < 1e-5  # a mirror
@@ -59,8 +59,8 @@ def test_white_metal_sends_out_its_directional_albedo_and_never_more_than_comes_
             assert float(out.mean()) <= 1.0 + 1e-3, (roughness, cos_o)
             z.append((float(out.mean()) - directional_albedo(roughness**2, cos_o)) / (error + QUADRATURE))
     z = np.array(z)
-    assert np.abs(z).max() < 3.0  # of 25 numbers with these seeds
-    assert abs(z.mean()) < 3.0 / 64**0.5  # all of them together: a bias of 1e-4
+    assert np.abs(z).max() < 3.0  # of 64 numbers with these seeds; measured 2.3
+    assert abs(z.mean()) < 3.0 / 64**0.5  # all of them together: a bias of 1e-4; measured 0.04
 
 
 def albedo(wo, alpha, base, metallic, u, **options):
@@ -84,7 +84,7 @@ def view(cos_o, device):
 def test_neither_specular_nor_diffuse_nor_metal_gains_energy(device, alpha):
     """Each alone, the published diffuse model too.  Coat and published diffuse lobe of a white dielectric together may:
     the lobe loses the energy of the microfacets, not that of the coat (docs/results.md)."""
-    u = halton(1 << 14).to(device)
+    u = halton(1 << 16).to(device)
     width, one = torch.tensor(alpha, device=device), torch.ones((), device=device)
     for cos_o in (0.02, *COSINES):
         metal, white, coat = (
@@ -103,7 +103,7 @@ def test_no_surface_sends_out_more_than_comes_in(device):
     highest, dielectric = 0.0, []
     for roughness in (1e-3, *ROUGHNESS):
         for cos_o in (1e-3, 0.01, *COSINES):
-            for metallic in (0.0, 0.02, 0.5, 1.0):
+            for metallic in (0.0, 0.02, 0.25, 0.5, 0.75, 1.0):
                 sent = albedo(view(cos_o, device), number(roughness**2), base, number(metallic), u)
                 highest = max(highest, float(sent.max()))
                 dielectric += [float(sent[0])] if metallic == 0.0 else []
