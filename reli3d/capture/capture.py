@@ -309,7 +309,7 @@ def _refined(
     are mapped alone.  If the two maps differ by more than a similarity, and these features fit the second one better,
     the object was moved relative to its surroundings.  The first map, if matches outside the masks fit it, still has
     the better lenses, and the better cameras within each group of views between which the object stayed in its place.
-    Otherwise masks that disagree are fused.
+    Otherwise masks that disagree are fused; of masks that agree, only what the fused ones have too is kept.
     """
     first = segmented.found
     down = np.stack([v.rotation[1] for v in first.views]).mean(0)
@@ -318,6 +318,10 @@ def _refined(
     report.epipolar_fit = epipolar_fit(first, segmented.masks)
     consistent = _agreement(segmented.views, segmented.masks) > SURE_AGREEMENT
     if report.epipolar_fit >= RIGID_FIT and consistent:
+        if known is None:  # the masks lack nothing, but may hold a contact shadow
+            fused = fused_masks(first, scene, segmented.masks)
+            masks = {name: np.minimum(mask, fused[name]) for name, mask in segmented.masks.items()}
+            segmented = _Segmented(first, {name: mask for name, mask in masks.items() if not is_empty(mask)})
         return segmented, up, ground
     views, by_name = segmented.views, {v.photo.name: v for v in first.views}
     lenses = first if report.surroundings_fit >= RIGID_FIT else None
