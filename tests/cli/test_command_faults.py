@@ -148,7 +148,7 @@ def test_a_signal_while_the_interpreter_ends_is_one_line_too(tmp_path, number, c
         assert process.stdout.readline().endswith("mesh.glb\n")
         printed = time.monotonic()
         time.sleep(0.15 * k)
-        early = time.monotonic() - printed < 0.75  # of 0.8
+        early = time.monotonic() - printed < 0.4  # of 0.8: the line may be read late
         process.send_signal(number)
         _, err = process.communicate(timeout=30)
         found = (process.returncode, len(lines_of(err)))
