@@ -1,4 +1,4 @@
-"""Counts planned for the scene: their variance against quadrature."""
+"""Counts planned for the scene: their variance against quadrature, and against each strategy alone."""
 
 import pytest
 import torch
@@ -15,9 +15,15 @@ from reli3d.render.image import plan_render, render_asset
 from reli3d.render.latlong import lat_long_directions
 from reli3d.render.shading import ShadeOptions
 from tests.support import reference
+from tests.support.bootstrap import interval
 from tests.support.meshes import mesh_from
-from tests.support.scenes import ball, eye, light
+from tests.support.scenes import SKIES, ball, eye, light
 from tests.support.surfaces import at, inputs, lit
+
+SINGLE = (64, 0, 0), (0, 64, 0), (0, 0, 64)
+GRID = [(name, r, m) for name in SKIES for r in (0.05, 0.3, 1.0) for m in (0.0, 1.0)]
+QUICK = ("sky", 0.3, 0.0), ("constant", 1.0, 1.0), ("sun", 0.3, 1.0)
+MIXED = {(name, r, m) for name, r, m in GRID if r < 1.0 and (m == 0.0 or name == "sun")}
 
 
 def surface(device, roughness, metallic, points=24):
@@ -27,16 +33,16 @@ def surface(device, roughness, metallic, points=24):
     return normal, normal, normal, wo, base, flat * roughness, flat * metallic
 
 
-def quadrature(arguments, environment, counts):
+def quadrature(arguments, environment, counts, inside=None, height=256):
     """Variance of each point under each of ``counts (C, 3)``, ``(N, C)``, summed over the channels: int f^2 / q - sum
-    n_k (int f p_k / q)^2 by midpoints in float64."""
+    n_k (int f p_k / q)^2 by midpoints in float64, ``inside (M,)`` or over the whole sphere."""
     _, _, normal, wo, base, roughness, metallic = (v.double().cpu() for v in arguments)
-    d, angle = reference.sphere_grid(256)
+    d, angle = reference.sphere_grid(height)
     radiance = reference.lookup_envmap(environment.radiance.double().cpu(), d)
     table = environment.pdf(d.float().to(environment.radiance.device)).double().cpu()
     rows = []
     for k in range(len(normal)):
-        up = ((d @ normal[k]) > 1e-6) & (radiance.sum(1) > 0.0)
+        up = ((d @ normal[k]) > 1e-6) & (radiance.sum(1) > 0.0) & (True if inside is None else inside)
         helper = torch.eye(3, dtype=torch.float64)[normal[k].abs().argmin()]
         t = torch.nn.functional.normalize(torch.linalg.cross(helper, normal[k]), dim=-1)
         frame = torch.stack([t, torch.linalg.cross(normal[k], t), normal[k]])
@@ -92,6 +98,47 @@ def deviation(a, b):
     """Largest difference of means of runs in standard errors, among which is rounding to float32."""
     error = ((a.var(0) + b.var(0)) / len(a)).sqrt() + 1e-6 * b.mean(0)
     return float(((a.mean(0) - b.mean(0)) / error).abs().max())
+
+
+def sun_part(arguments, environment):
+    """The sun's contribution to each point's variance by each single strategy, by quadrature."""
+    d, _ = reference.sphere_grid(512)
+    bright = reference.lookup_envmap(environment.radiance.double().cpu(), d).amax(1) > 10.0
+    alone = torch.tensor(SINGLE, dtype=torch.float64)
+    return quadrature(arguments, environment, alone, inside=bright, height=512)
+
+
+def compare(case, points, device, runs=256):
+    """Variance of the plan over that of the best single strategy, its 95 % interval, and the plan.
+
+    Runs that never drew the sun do not count: a strategy whose variance is below a hundredth of what the sun alone
+    makes by quadrature has that, and the ratio no interval.
+    """
+    name, roughness, metallic = case
+    arguments, env = surface(device, roughness, metallic), light(name, device)
+    plan = plan_samples(*at(*arguments), env, options=ShadeOptions(sequence=points))
+    options = {"sequence": points, "antithetic": "none", "runs": runs}
+    mixed, *alone = (runs_of(arguments, env, c, **options).flatten(1).cpu() for c in (plan.samples, *SINGLE))
+    own, *variance = (3.0 * float(v.var(0).mean()) for v in (mixed, *alone))  # the three channels' sum
+    hidden = sun_part(arguments, env).mean(0).tolist() if name == "sun" else [0.0] * 3
+    true = [h if v < 0.01 * h else v for v, h in zip(variance, hidden)]
+    best = true.index(min(true))
+    ratio = own / true[best]
+    return ratio, interval(mixed, alone[best]) if true[best] == variance[best] else [ratio] * 2, plan
+
+
+def check_case(case, points, device):
+    """Protocol: at most 1.05 of the best strategy.  Where the plan is that strategy both have the same numbers."""
+    ratio, (low, high), plan = compare(case, points, device)
+    assert ratio <= 1.05 and low <= 1.05, (case, points, ratio, low, high, plan)
+    if case in MIXED:
+        assert high < 1.0, (case, points, ratio, low, high, plan)
+
+
+@pytest.mark.parametrize("points", ["random", "halton"])
+@pytest.mark.parametrize("case", [c if c in QUICK else pytest.param(c, marks=pytest.mark.slow) for c in GRID])
+def test_no_strategy_alone_is_better_than_the_plan(device, case, points):
+    check_case(case, points, device)
 
 
 def test_the_pilot_sees_shadows(device):
@@ -157,17 +204,19 @@ def test_the_plan_depends_on_inputs_and_seed_alone_and_takes_any_size(device):
 
 def test_bad_input_is_named(device):
     arguments, env = surface(device, 0.4, 0.5), light("sky", device)
-    options = lambda **o: {"options": ShadeOptions(**o)}  # noqa: E731
-    for given, change, kind, message in (
-        (arguments, lambda: {"total": 0}, ValueError, "total: expected"),
-        (arguments, lambda: {"total": 2.5}, ValueError, "total: expected"),
-        ([v[:0] for v in arguments], dict, ValueError, "position: expected at least one"),
-        (arguments, lambda: options(alpha="cubed"), ValueError, "alpha: expected one of"),
-        ((*arguments[:6], arguments[6].double()), dict, TypeError, "metallic: expected"),
-        ((*arguments[:4], arguments[4] * torch.nan, *arguments[5:]), dict, ValueError, "got NaN"),
-    ):
-        with pytest.raises(kind, match=message):
-            plan_samples(*at(*given), env, **change())
+    for total in (0, 2.5):
+        with pytest.raises(ValueError, match="total: expected"):
+            plan_samples(*at(*arguments), env, total=total)
+    with pytest.raises(ValueError, match="position: expected at least one"):
+        plan_samples(*at(*(v[:0] for v in arguments)), env)
+    with pytest.raises(ValueError, match="alpha: expected one of"):
+        plan_samples(*at(*arguments), env, options=ShadeOptions(alpha="cubed"))
+    with pytest.raises(ValueError, match="sequence: expected one of"):
+        plan_samples(*at(*arguments), env, options=ShadeOptions(sequence="sobol"))
+    with pytest.raises(TypeError, match="metallic: expected"):
+        plan_samples(*at(*arguments[:6], arguments[6].double()), env)
+    with pytest.raises(ValueError, match="got NaN"):
+        plan_samples(*at(*arguments[:4], arguments[4] * torch.nan, *arguments[5:]), env)
     camera = Camera.from_fov(eye(device, 0.0, 0.0, 2.0), 0.8, 8, 8)
     away = Camera(eye(device, 0.0, 0.0, 2.0), camera.intrinsics.new_tensor([9.0, 9.0, 900.0, 4.0]), 8, 8)
     with pytest.raises(ValueError, match="camera: expected the asset in view"):

@@ -6,6 +6,7 @@ import trimesh
 
 from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
+from tests.support.bootstrap import interval
 from tests.support.meshes import mesh_from
 from tests.support.scenes import SKIES, light, sky
 from tests.support.surfaces import at, inputs, lit, on_ball
@@ -162,35 +163,47 @@ def test_pairs_cancel_the_gradients_of_the_lobe(device, name):
     assert pair[1] < 0.01 * alone[1] and pair[2] < 0.01 * alone[2]  # measured 0.0005 and 0.0002
 
 
-# pairs from independent numbers, 4096 runs: at most as noisy; from rotated Halton points, as shipped: less noisy
-PAIRS = {
-    "independent": ({"seed": 3}, 4096, 1024, (0.05, 0.1, 0.3, 0.6, 1.0)),
-    "shipped": ({"sequence": "halton", "seed": 1}, 256, 256, (0.05, 0.1, 0.3, 1.0)),
-}
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SKIES)
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_pairs_are_never_noisier_than_as_many_independent_samples(device, name, metallic):
+    """The published counts with independent numbers on either side, 4096 runs: 1.05 at most, and less than 1 where the
+    light is smooth and the surface too.  Measured 0.0001 to 1.00 without the sun, in it up to 1.04 with an interval of
+    1.00 to 1.09; gradients of single texels, of 1024 runs, 0.61 to 1.00."""
+    env = light(name, device)
+    for roughness in (0.05, 0.1, 0.3, 0.6, 1.0):
+        pairs, alone = (
+            [
+                variance(v)
+                for v in (
+                    *spread(roughness, metallic, env, runs=4096, **o),
+                    texel_spread(roughness, metallic, env, runs=1024, **o),
+                )
+            ]
+            for o in ({"seed": 3}, {"antithetic": "none", "seed": 2})
+        )
+        ratio = dict(zip(COLUMNS, (a / b for a, b in zip(pairs, alone)), strict=True))
+        assert max(ratio.values()) < 1.05, (roughness, ratio)
+        ratio.pop("texels")
+        assert name == "sun" or roughness < 0.3 or max(ratio.values()) < 0.96, (roughness, ratio)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pairs", PAIRS)
 @pytest.mark.parametrize("name", SKIES)
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
-def test_pairs_are_never_noisier_than_as_many_independent_samples(device, name, metallic, pairs):
-    """Measured with independent numbers 0.0001 to 1.00, in the sun up to 1.04 with an interval of 1.00 to 1.09, texels
-    0.61 to 1.00; as shipped 0.0001 to 0.66, 0.79 to 0.85 in value and base color of metal of 0.05, texels, in whose few
-    samples the points are not even, 0.31 to 1.00."""
-    env, (options, runs, texel_runs, finishes) = light(name, device), PAIRS[pairs]
-    for roughness in finishes:
-        pairs_of, alone = (
-            [variance(v) for v in spread(roughness, metallic, env, runs=runs, **o)]
-            + [variance(texel_spread(roughness, metallic, env, runs=texel_runs, **o))]
-            for o in (options, {"antithetic": "none", "seed": 2})
+def test_pairs_as_shipped_are_less_noisy_than_as_many_independent_samples(device, name, metallic):
+    """The published counts with pairs from rotated Halton points: measured 0.0001 to 0.66, and 0.79 to 0.85 in value
+    and base color of metal of 0.05; gradients of single texels, in whose few samples the points are not even, 0.31 to
+    1.00."""
+    env = light(name, device)
+    for roughness in (0.05, 0.1, 0.3, 1.0):
+        pairs, alone = (
+            [variance(v) for v in (*spread(roughness, metallic, env, **o), texel_spread(roughness, metallic, env, **o))]
+            for o in ({"sequence": "halton", "seed": 1}, {"antithetic": "none", "seed": 2})
         )
-        ratio = dict(zip(COLUMNS, (a / b for a, b in zip(pairs_of, alone)), strict=True))
-        assert max(ratio.values()) < 1.05, (roughness, ratio)
-        ratio.pop("texels")
-        limit = 0.95 if (roughness, metallic) == (0.05, 1.0) else 0.8
-        if pairs == "independent":
-            limit = 1.05 if name == "sun" or roughness < 0.3 else 0.96
-        assert max(ratio.values()) < limit, (roughness, ratio)
+        ratio = dict(zip(COLUMNS, (a / b for a, b in zip(pairs, alone)), strict=True))
+        assert ratio.pop("texels") < 1.05, (roughness, ratio)
+        assert max(ratio.values()) < (0.95 if (roughness, metallic) == (0.05, 1.0) else 0.8), (roughness, ratio)
 
 
 @pytest.mark.slow
@@ -210,3 +223,23 @@ def test_the_balance_heuristic_keeps_its_bound(device, name):
             bound = best + (1 / min(counts) - 1 / sum(counts)) * mixed.mean(0).square()
             # variances of 256 runs err by 9 % each where the tails are light
             assert bool((mixed.var(0) <= 1.5 * bound).all()), (roughness, metallic)
+
+
+@pytest.mark.slow
+def test_the_mixture_wins_mixed_cases_and_its_worst_case_is_a_hundred_times_better(device):
+    """Against all 64 samples by one strategy.  No fixed mixture stays within 1.05 of the best: where the integrand is a
+    multiple of one density, that strategy has no variance at all (docs/results.md)."""
+    counts = (20, 40, 4), (64, 0, 0), (0, 64, 0), (0, 0, 64)
+    worst, wins = [0.0] * 4, set()
+    for name in SKIES:
+        env = light(name, device)
+        for roughness in (0.05, 0.3, 1.0):
+            for metallic in (0.0, 1.0):
+                runs = [spread(roughness, metallic, env, samples=c)[0].cpu() for c in counts]
+                found = [variance(r) for r in runs]
+                worst = [max(a, b) for a, b in zip(worst, found)]
+                best = 1 + min(range(3), key=lambda k: found[1 + k])
+                if interval(runs[0], runs[best])[1] < 1.0:
+                    wins.add((name, roughness, metallic))
+    assert wins >= {("sky", 0.05, 0.0), ("sky", 0.3, 0.0), ("sun", 0.3, 1.0)}  # coat over diffuse; glossy metal and sun
+    assert worst[0] * 100.0 < min(worst[1:]), worst

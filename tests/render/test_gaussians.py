@@ -130,9 +130,9 @@ def shading_inputs(device, n=6, seed=3):
 
 
 def test_gradients_stay_finite_at_the_edges(device):
-    """Twenty thousand points: mirrors and rough, metals, black; views along the normal, in the surface, behind it;
+    """A hundred thousand points: mirrors and rough, metals, black; views along the normal, in the surface, behind it;
     lobes along the normal or the view of one of them, against it, nearly constant and as sharp as a laser."""
-    n, rng = 20_000, torch.Generator().manual_seed(5)
+    n, rng = 100_000, torch.Generator().manual_seed(5)
     normal, wo, base, rough, metal = shading_inputs("cpu", n)
     kind = torch.arange(n) % 16
     rough[kind < 4], rough[kind == 4] = 0.0, 1.0

@@ -190,21 +190,35 @@ def test_directions_return_to_the_numbers_they_came_from(device):
         assert float(off.abs().max()) < 1e-4 and float(sure.double().mean()) > 0.95, (alpha, deg)
 
 
-def test_random_pairs_are_uniform_and_their_streams_independent():
-    """Neighboring counters; of a million pairs of 48 bits by chance 0.002 would be equal."""
-    base, big = dict(seed=3, sample=5, dimension=1), 1 << 16
-    others = [*({"seed": k} for k in (4, 5, big)), *({"sample": k} for k in (6, 7, big)), {"dimension": 2}, {}]
-    streams = [reference.random_pairs(125_000, **{**base, **other}) for other in others]
-    first = streams[-1].numpy()
-    assert first.min() >= 0.0 and first.max() < 1.0
-    counts, _, _ = np.histogram2d(first[:, 0], first[:, 1], bins=32, range=[[0, 1], [0, 1]])
+def test_random_pairs_are_uniform_independent_and_addressed():
+    u = reference.random_pairs(200_000, seed=3, sample=5, dimension=1).numpy()
+    assert u.min() >= 0.0 and u.max() < 1.0
+    counts, _, _ = np.histogram2d(u[:, 0], u[:, 1], bins=32, range=[[0, 1], [0, 1]])
     stat = ((counts - counts.mean()) ** 2 / counts.mean()).sum()
     assert abs(stat - 1023) < 4.5 * (2 * 1023) ** 0.5  # chi-square of 1024 cells
-    for other in streams[:-1]:
-        assert abs(np.corrcoef(first.ravel(), other.numpy().ravel())[0, 1]) < 4.5 / 250_000**0.5
-    bits = (torch.cat(streams).double() * 2**24).long()
-    assert len(torch.unique(bits[:, 0] * 2**24 + bits[:, 1])) == len(bits)
-    assert np.array_equal(first[:100], reference.random_pairs(100, **base).numpy())
+    for other in ({"seed": 4}, {"sample": 6}, {"dimension": 2}):
+        v = reference.random_pairs(200_000, **{"seed": 3, "sample": 5, "dimension": 1, **other}).numpy()
+        assert abs(np.corrcoef(u.ravel(), v.ravel())[0, 1]) < 4.5 / 400_000**0.5
+    assert np.array_equal(u[:100], reference.random_pairs(100, seed=3, sample=5, dimension=1).numpy())
+
+
+def test_streams_have_distinct_states():
+    """A million pairs of 48 bits from ten streams of neighboring counters; by chance 0.002 would be equal."""
+    streams = [
+        {},
+        {"seed": 1},
+        {"seed": 2},
+        {"seed": 1 << 16},
+        {"sample": 1},
+        {"sample": 2},
+        {"sample": 1 << 16},
+        {"dimension": 1},
+        {"dimension": 2},
+        {"seed": 1, "sample": 1, "dimension": 1},
+    ]
+    u = torch.cat([reference.random_pairs(100_000, **stream) for stream in streams])
+    bits = (u.double() * 2**24).long()
+    assert len(torch.unique(bits[:, 0] * 2**24 + bits[:, 1])) == len(u)
 
 
 def test_halton_points_are_the_radical_inverses():
@@ -214,15 +228,15 @@ def test_halton_points_are_the_radical_inverses():
 
 def test_bad_input_is_named(device):
     wo, alpha, u = torch.rand(4, 3, device=device), torch.rand(4, device=device), torch.rand(4, 2, device=device)
+    with pytest.raises(ValueError, match="u: expected shape"):
+        sample_ggx_vndf(wo, alpha, wo)
+    with pytest.raises(ValueError, match="lobe: expected"):
+        sample_bsdf(wo, alpha, u, lobe="other")
     assert sample_ggx_vndf(wo[:0], alpha[:0], u[:0]).shape == (0, 3)
-    for call, message in (
-        (lambda: sample_ggx_vndf(wo, alpha, wo), "u: expected shape"),
-        (lambda: sample_bsdf(wo, alpha, u, lobe="other"), "lobe: expected"),
-        (
-            lambda: sample_ggx_vndf(wo, alpha[:3], u),
-            r"wo, alpha, u: expected shapes that broadcast, got .*\(3,\)",
-        ),
-        (lambda: eval_bsdf(wo, wo[0], alpha[:3], alpha[0], wo[0]), "expected shapes that broadcast"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            call()
+
+
+def test_shapes_that_do_not_broadcast_are_named():
+    with pytest.raises(ValueError, match=r"wo, alpha, u: expected shapes that broadcast, got .*\(5,\).*\(4,\)"):
+        sample_ggx_vndf(torch.rand(5, 3), torch.rand(4), torch.rand(5, 2))
+    with pytest.raises(ValueError, match="expected shapes that broadcast"):
+        eval_bsdf(torch.rand(5, 3), torch.rand(3), torch.rand(4), torch.rand(()), torch.rand(3))
