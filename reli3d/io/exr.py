@@ -74,11 +74,8 @@ def _header(path, notes: list[str], max_pixels: int) -> tuple[dict, list[str]]:
     if parts != 1 or header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
         raise InputError(path, "EXR kind: expected one flat image, got a deep or multi-part file; save as a plain EXR")
     names = [n for n in "RGB" if n in channels] or [n for n in "Y" if n in channels]
-    if (
-        len(names) not in (1, 3)
-        or names == ["R"]
-        or (names == ["Y"] and (channels.keys() & {"RY", "BY"} or channels.keys() >= {"X", "Z"}))
-    ):
+    other = channels.keys() & {"RY", "BY"} or channels.keys() >= {"X", "Z"}  # Y is luminance or of CIE XYZ
+    if names != list("RGB") and (names != ["Y"] or other):
         raise InputError(path, f"channels: expected R, G, B or Y, got {shown(sorted(channels))}; save as plain RGB")
     if any(step != (1, 1) for step in channels.values()):
         raise InputError(path, "channels: expected one sample for each pixel, got subsampled ones; save as plain RGB")

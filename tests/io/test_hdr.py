@@ -281,6 +281,7 @@ PLANE = np.ones((4, 8), np.float32)
         ({"Y": PLANE, "RY": PLANE, "BY": PLANE}, {}, "channels: expected R, G, B or Y, got"),
         ({"X": PLANE, "Y": PLANE, "Z": PLANE}, {}, "channels: expected R, G, B or Y, got"),
         ({"R": PLANE, "G": PLANE}, {}, "channels: expected R, G, B or Y, got"),
+        ({"G": PLANE}, {}, "channels: expected R, G, B or Y, got"),
         ({"left.R": PLANE, "left.G": PLANE, "left.B": PLANE}, {}, "channels: expected R, G, B or Y, got"),
         ({"Y": PLANE}, {"type": OpenEXR.tiledimage, "tiles": tiles(OpenEXR.MIPMAP_LEVELS)}, "EXR tiles: expected one"),
         ({"Y": PLANE}, {"envmap": OpenEXR.ENVMAP_CUBE}, "envmap: expected a lat-long map"),
