@@ -6,13 +6,7 @@ import numpy as np
 import torch
 
 from reli3d.nn.model import Reconstructor
-from reli3d.nn.presets import (
-    OFFICIAL,
-    BackboneSizes,
-    EncoderSizes,
-    IlluminationSizes,
-    UpsamplerSizes,
-)
+from reli3d.nn.presets import OFFICIAL, BackboneSizes, EncoderSizes, IlluminationSizes, UpsamplerSizes
 from reli3d.nn.reni import EnvironmentDecoder
 from reli3d.nn.weights import published_state, read_manifest, read_tensors
 
@@ -44,14 +38,10 @@ NANO = replace(  # the paper's network at sizes that run in milliseconds, withou
     plane_size=4,
     backbone=BackboneSizes(heads=2, latents=8, blocks=1, basic_blocks=1, experts=0, experts_from=0, groups=4),
     upsampler=UpsamplerSizes(convolutions=2, scale=4, channels=24),
-    illumination=IlluminationSizes(
+    illumination=replace(
+        TINY.illumination,
         encoder=EncoderSizes(hidden=16, layers=1, heads=2, patch=8, grid=4, mask_channel=True),
-        tokens=78,
-        token_width=16,
-        width=32,
         heads=2,
-        layers=1,
-        groups=4,
     ),
     reni=replace(OFFICIAL.reni, height=4),
     roughness_is_alpha=False,

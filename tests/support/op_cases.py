@@ -153,11 +153,8 @@ def lit(shadows: str | None = None, **options):
         scene = None
         if shadows:
             vertices, faces = ball(normal.device)
-            scene = RayScene(
-                vertices + torch.tensor([0.0, 1.0, 0.0], device=normal.device, dtype=torch.float32),
-                faces,
-                backend=shadows if normal.device.type == "cpu" else "warp",
-            )
+            backend = shadows if normal.device.type == "cpu" else "warp"
+            scene = RayScene(vertices + vertices.new_tensor([0.0, 1.0, 0.0]), faces, backend=backend)
         points, wo = at(0.2 * ng, normal, ng, wo, base_color, roughness, metallic)
         return (shade(points, wo, Environment(radiance), scene=scene, options=ShadeOptions(seed=3, **options)),)
 
@@ -218,22 +215,13 @@ def textured(n: int) -> dict[str, Tensor]:
     maps = {name: uniform(6, 6, seed=k) for k, name in ((11, "roughness"), (12, "metallic"))}
     maps["base_color"], maps["normal"] = uniform(6, 6, 3, seed=10), 0.5 + 0.5 * above(36, 13).reshape(6, 6, 3)
     v = corners(60)
-    return {
-        "vertices": v,
-        "normals": above(len(v), 8),
-        "uv": uniform(len(v), 2, seed=9, high=2.0),
-        **maps,
-        "bary": weights(n),
-    }
+    uv = uniform(len(v), 2, seed=9, high=2.0)
+    return {"vertices": v, "normals": above(len(v), 8), "uv": uv, **maps, "bary": weights(n)}
 
 
 def lobes(n: int, name: str) -> dict[str, Tensor]:
-    return {
-        "axis": units(12, 1),
-        "sharpness": uniform(12, seed=2, low=0.5, high=30.0),
-        "amplitude": uniform(12, 3),
-        name: units(n, 3),
-    }
+    sharpness = uniform(12, seed=2, low=0.5, high=30.0)
+    return {"axis": units(12, 1), "sharpness": sharpness, "amplitude": uniform(12, 3), name: units(n, 3)}
 
 
 def bsdf(diffuse_model):
@@ -289,9 +277,7 @@ def marched(origins, directions):
 def texels(vertices):
     n = len(vertices)
     faces, _ = soup(vertices, 0)
-    uv = torch.tensor([[0.05, 0.1], [0.9, 0.2], [0.15, 0.85]], device=vertices.device, dtype=torch.float32).repeat(
-        n // 3, 1
-    )
+    uv = vertices.new_tensor([[0.05, 0.1], [0.9, 0.2], [0.15, 0.85]]).repeat(n // 3, 1)
     cell = torch.arange(n // 3, device=vertices.device).repeat_interleave(3)
     uv = (uv + torch.stack([cell % 4, cell // 4], -1)) / 4.0
     mesh = Mesh(vertices, faces, normalize(vertices.contiguous(), dim=-1), uv)
@@ -343,17 +329,7 @@ def drawn(u, radiance, wo, alpha):
     light = Environment(radiance)
     directions, density = light.sample(u)
     wi = sampling.sample_cosine(u)
-    return (
-        directions,
-        density,
-        light.pdf(wi),
-        wi,
-        material.pdf_lobes(wo, alpha, wi),
-    )
-
-
-def four(values, bary):
-    return (interpolate(values, *soup(values, len(bary)), bary),)
+    return directions, density, light.pdf(wi), wi, material.pdf_lobes(wo, alpha, wi)
 
 
 FRAME = dict(normal=units(N, 5), tangent=torch.nn.functional.pad(units(N, 6), (0, 1), value=1.0))
@@ -362,10 +338,10 @@ MATERIAL = ("wo", "wi", "base_color", "alpha", "metallic")
 GRID = ("sdf", "deformation", "alpha", "beta")
 
 CASES = {
-    "interpolate": Case(
-        lambda n: {"values": uniform(180, 3, seed=1), "bary": weights(n)},
-        lambda values, bary: (interpolate(values, *soup(values, len(bary)), bary),), ("values", "bary"),
-        ("bary",)),
+    **{name: Case(lambda n, width=width: {"values": uniform(180, width, seed=1), "bary": weights(n)},
+                  lambda values, bary: (interpolate(values, *soup(values, len(bary)), bary),), ("values", "bary"),
+                  ("bary",))
+       for name, width in (("interpolate", 3), ("interpolate tangents", 4))},
     "hit_normals": Case(
         lambda n: {"vertices": corners(60)}, lambda vertices: (hit_normals(vertices, *soup(vertices, N)),),
         ("vertices",)),
@@ -459,38 +435,20 @@ CASES |= {  # without gradient
     "closest, Warp": Case(rays, traced("warp"), rows=("origins", "directions")),
     "closest, Embree": Case(rays, traced("embree"), rows=("origins", "directions")),
     "draws": Case(
-        lambda n: {
-            "u": numbers(n),
-            "radiance": uniform(8, 16, 3, seed=5),
-            "wo": above(n, 1),
-            "alpha": uniform(n, seed=2, low=0.1),
-        },
-        drawn,
-        rows=("u", "wo", "alpha"),
-    ),
+        lambda n: {"u": numbers(n), "radiance": uniform(8, 16, 3, seed=5), "wo": above(n, 1),
+                   "alpha": uniform(n, seed=2, low=0.1)},
+        drawn, rows=("u", "wo", "alpha")),
     "march_rays": Case(
-        lambda n: {"origins": 2.0 * units(n, 1), "directions": units(n, 2)}, marched, rows=("origins", "directions")
-    ),
+        lambda n: {"origins": 2.0 * units(n, 1), "directions": units(n, 2)}, marched, rows=("origins", "directions")),
     "bake": Case(lambda n: {"vertices": corners(12)}, texels),
     "views": Case(
-        lambda n: {"points": uniform(n, 3, seed=1, low=-0.6, high=0.6), "normal": units(n, 2)},
-        seen_from,
-        rows=("points", "normal"),
-    ),
+        lambda n: {"points": uniform(n, 3, seed=1, low=-0.6, high=0.6), "normal": units(n, 2)}, seen_from,
+        rows=("points", "normal")),
     "hull": Case(
-        lambda n: {"masks": (uniform(3, 24, 20, seed=1) > 0.6).float(), "points": uniform(n, 3, low=-0.8)},
-        hulls,
-        rows=("points",),
-    ),
+        lambda n: {"masks": (uniform(3, 24, 20, seed=1) > 0.6).float(), "points": uniform(n, 3, low=-0.8)}, hulls,
+        rows=("points",)),
     "cover_silhouettes": Case(
-        lambda n: {
-            "sdf": uniform(12, 11, 10, seed=1, low=0.1, high=2.0),
-            "bound": uniform(12, 11, 10, low=-3.0),
-            "masks": hull_masks(),
-        },
-        covered,
-    ),
-    "interpolate tangents": Case(
-        lambda n: {"values": uniform(180, 4, seed=1), "bary": weights(n)}, four, ("values", "bary"), ("bary",)
-    ),
-}
+        lambda n: {"sdf": uniform(12, 11, 10, seed=1, low=0.1, high=2.0), "bound": uniform(12, 11, 10, low=-3.0),
+                   "masks": hull_masks()},
+        covered),
+}  # fmt: skip

@@ -144,19 +144,6 @@ def test_an_object_without_a_whole_pixel_has_no_terms(files):
         torch.testing.assert_close(both[name], value, rtol=1e-3, atol=1e-5, msg=name)
 
 
-def test_a_checkpoint_of_small_images_is_no_whole_network(folder, tmp_path, capsys):
-    few = ["--steps", "1", "--batch", "1"]
-    assert main([str(folder), str(tmp_path / "64"), "--stage", "pixels", "--image-size", "64", *few]) == 0
-    assert main([str(folder), str(tmp_path / "64"), "--export", str(tmp_path / "net.safetensors")]) == 2
-    assert not (tmp_path / "net.safetensors").exists()
-    assert main([str(folder), str(tmp_path / "64"), "--stage", "pixels", "--image-size", "128", *few]) == 2
-    assert "name another output folder, and this file by --weights" in capsys.readouterr().err
-    state = torch.load(tmp_path / "64" / "state.pt", weights_only=True)
-    del state["average"]["pyramid.shared.weight"]
-    with pytest.raises(ValueError, match="pyramid.shared.weight"):
-        load_levels(LocalReconstructor(SMALL), state["average"])
-
-
 def test_every_view_of_a_drawn_object_is_read_once(folder):
     files, cache = sorted(folder.glob("*.safetensors")), ViewCache(2)
     group = draw_group(files, [(1, k) for k in range(3)], cache, max_views=4)
@@ -167,10 +154,15 @@ def test_every_view_of_a_drawn_object_is_read_once(folder):
     assert not torch.equal(other.views.c2w, group.views.c2w)
 
 
-def test_levels_are_trained_one_after_the_other(folder, tmp_path):
+def test_levels_are_trained_one_after_the_other(folder, tmp_path, capsys):
     """From images of 64 pixels to the whole network by the command; each stage keeps the weights of the one before."""
     start = ["--steps", "1", "--batch", "1", "--rate", "1e-9"]
     assert main([str(folder), str(tmp_path / "64"), "--stage", "pixels", "--image-size", "64", *start]) == 0
+    assert main([str(folder), str(tmp_path / "64"), "--export", str(tmp_path / "net.safetensors")]) == 2
+    assert not (tmp_path / "net.safetensors").exists()
+    for other in (["--stage", "pixels", "--image-size", "128"], []):  # another level, another stage
+        assert main([str(folder), str(tmp_path / "64"), *other, *start]) == 2
+        assert "name another output folder, and this file by --weights" in capsys.readouterr().err
     from_64, from_128 = (["--weights", str(tmp_path / name / "state.pt")] for name in ("64", "128"))
     assert main([str(folder), str(tmp_path / "128"), "--stage", "pixels", "--image-size", "128", *from_64, *start]) == 0
     assert main([str(folder), str(tmp_path / "all"), *from_128, *start]) == 0
@@ -181,6 +173,9 @@ def test_levels_are_trained_one_after_the_other(folder, tmp_path):
     assert set(small) - set(middle) == set() and set(middle) < set(whole)
     for fewer, more in ((small, middle), (middle, whole)):
         assert all(float((more[k] - v).abs().max()) < 1e-6 for k, v in fewer.items())
+    del small["pyramid.shared.weight"]
+    with pytest.raises(ValueError, match="pyramid.shared.weight"):
+        load_levels(LocalReconstructor(SMALL), small)
 
 
 def test_training_of_pixels_teaches_the_2d_u_net_alone(folder, tmp_path):

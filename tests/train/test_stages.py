@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from reli3d.geometry.camera import camera_rays
+from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
 from reli3d.render.color import linear_to_srgb
@@ -18,7 +18,7 @@ from reli3d.train.stages.losses import compared_colors, gradients, light_terms, 
 from reli3d.train.stages.rendering import Rendering, display, lobes
 from reli3d.train.stages.step import encode, object_losses, renderings, shader_of, total
 from reli3d.train.stages.surface import render_surface, surface
-from reli3d.train.stages.views import ObjectViews, Samples, draw
+from reli3d.train.stages.views import Samples, draw
 from reli3d.train.stages.volume import occupied, render_volume
 from tests.support.stages import RADIUS, ball_model, camera
 
@@ -46,20 +46,12 @@ def test_tiny_has_less_than_a_million_parameters():
 
 def test_the_papers_numbers():
     weights = vars(Weights())
-    paper = {
-        "image": 10,
-        "perceptual": 2,
-        "mask": 10,
-        "material": 10,
-        "normal": 4,
-        "flat": 0.05,
-        "latent": 0.1,
-        "neutral": 0.02,
-    }
+    paper = dict(image=10, perceptual=2, mask=10, material=10, normal=4, flat=0.05, latent=0.1, neutral=0.02)
     assert {name: weights[name] for name in paper} == paper
     assert [s.batch for s in PAPER.values()] == [64, 192, 192, 192, 32]
     assert {s.rate for s in PAPER.values()} == {5e-5} and {s.steps for s in PAPER.values()} == {60_000}
     assert PAPER["monte_carlo"].samples == (20, 40, 4) and PAPER["monte_carlo"].shadows
+    assert all(name == stage.name for stages in (PAPER, TINY_STAGES) for name, stage in stages.items())
 
 
 def test_a_draw_is_a_function_of_its_seed_and_compares_unread_views(source):
@@ -78,16 +70,12 @@ def test_a_draw_is_a_function_of_its_seed_and_compares_unread_views(source):
 
 def test_a_window_looks_through_the_same_pixels(one):
     part = one.targets.window(5, 3, 8)
-    whole, cut = (camera_rays_of(v) for v in (one.targets, part))
+    whole, cut = (
+        camera_rays(Camera(v.c2w[0], v.intrinsics[0], v.images.shape[1], v.images.shape[1]))[1]
+        for v in (one.targets, part)
+    )
     torch.testing.assert_close(cut, whole[3:11, 5:13], rtol=0, atol=1e-6)
     assert torch.equal(part.images[0], one.targets.images[0, 3:11, 5:13])
-
-
-def camera_rays_of(views: ObjectViews):
-    from reli3d.geometry.camera import Camera
-
-    size = views.images.shape[1]
-    return camera_rays(Camera(views.c2w[0], views.intrinsics[0], size, size))[1]
 
 
 def test_display_values_continue_beyond_white():
@@ -171,12 +159,6 @@ def test_the_lights_samples_alone_and_all_strategies_show_the_same_radiance(monk
     # 4096 samples of a highlight that a hundredth of them meets: some per cent of a point, less of the mean
     assert float((alone - together).abs().mean() / together.mean()) < 0.02
     assert float(alone.mean() / together.mean()) == pytest.approx(1.0, abs=0.005)
-
-
-@pytest.mark.parametrize("samples", [(0, 0, 0), (4, -1, 2), (4, 4)])
-def test_a_stage_without_samples_is_refused(samples):
-    with pytest.raises(ValueError, match="^samples: expected three counts of at least 0, one above 0, got "):
-        replace(MONTE_CARLO, samples=samples)
 
 
 def test_terms_without_ground_truth_are_not_computed(one):
@@ -279,12 +261,14 @@ def test_a_field_of_one_sign_is_pulled_across_zero(one):
     assert bool(torch.isfinite(gradient).all())
 
 
-def test_the_shipped_stages_are_named_by_their_keys():
-    for stages in (PAPER, TINY_STAGES):
-        assert all(name == stage.name for name, stage in stages.items())
+COUNTS = "samples: expected three counts of at least 0, one above 0"
 
 
-@pytest.mark.parametrize("wrong", [{"renderer": "mesh"}, {"patch": 25}])
-def test_a_stage_refuses_invalid_options(wrong):
-    with pytest.raises(ValueError, match="expected .*, got"):
-        replace(GAUSSIANS, **wrong)
+@pytest.mark.parametrize(
+    "wrong, message",
+    [({"renderer": "mesh"}, ".*expected .*"), ({"patch": 25}, ".*expected .*")]
+    + [({"samples": samples}, COUNTS) for samples in ((0, 0, 0), (4, -1, 2), (4, 4))],
+)
+def test_a_stage_refuses_invalid_options(wrong, message):
+    with pytest.raises(ValueError, match=f"^{message}, got "):
+        replace(MONTE_CARLO if "samples" in wrong else GAUSSIANS, **wrong)

@@ -32,7 +32,7 @@ from reli3d.train.losses import (
     pattern_loss,
     perturbed,
 )
-from reli3d.train.small import FAST_RATE, PixelStage, SmallOptions, SmallStage
+from reli3d.train.small import FAST_RATE, SmallOptions, SmallStage
 from reli3d.train.stage import Options
 from reli3d.train.stages.latents import load_prior
 
@@ -281,14 +281,6 @@ def test_convolutions_in_bfloat16_change_the_losses_by_their_rounding(samples):
         assert float(found[1][0][name]) == pytest.approx(float(value), rel=0.01, abs=near), name
         assert not torch.equal(found[1][0][name], value), name
     assert float(torch.nn.functional.cosine_similarity(found[0][1], found[1][1], 0)) > 0.999
-
-
-def test_a_checkpoint_of_another_stage_is_not_resumed_but_gives_its_weights(folder, tmp_path, capsys):
-    stage = PixelStage(LocalReconstructor(SMALL), [folder])
-    train(stage, stage.options(str(tmp_path), steps=1, batch=1))
-    assert main([str(folder), str(tmp_path), "--steps", "2", "--batch", "1"]) == 2
-    assert "name another output folder, and this file by --weights" in capsys.readouterr().err
-    step_from(folder, tmp_path / "next", str(tmp_path / "state.pt"))
 
 
 def step_from(folder, out, weights):
