@@ -42,8 +42,9 @@ def test_a_decoded_map_is_found_again(decoder, height):
     rows = torch.sin((torch.arange(height, device=device) + 0.5) * math.pi / height)[:, None, None]
     measured = float(((again.log() - radiance.log()).abs() * rows).mean() / rows.mean())
     assert measured < 1.3 * error  # the reported error, up to the floor of the logarithm
-    _, twice, _ = fit_latent(decoder, 2.0 * radiance[0], steps=120)
-    # on CUDA sums take any order, which 120 steps amplify: 1.5e-3 measured
+    _, level, _ = fit_latent(decoder, radiance[0], steps=20)
+    _, twice, _ = fit_latent(decoder, 2.0 * radiance[0], steps=20)
+    # on CUDA sums take any order, which steps amplify: 1.5e-3 measured after 120
     most = 1e-3 if device.type == "cpu" else 3e-3
     torch.testing.assert_close(twice - level, torch.tensor(math.log(2.0), device=device), rtol=0, atol=most)
     assert all(torch.equal(a, b) and b.grad is None for a, b in zip(before, decoder.parameters(), strict=True))

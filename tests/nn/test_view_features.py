@@ -25,11 +25,13 @@ def rig(views: int, device: torch.device) -> ViewMaps:
     return ViewMaps(tokens.to(device), images.to(device), Camera(c2w, intrinsics, SIZE, SIZE).to(device))
 
 
-def surface(n: int, views: int, device: torch.device):
+def surface(n: int, views: int, device: torch.device, on_surface: bool = True):
+    """Points, visibility and normals; the latter two are None of points in free space."""
     g = torch.Generator().manual_seed(n)
     points = torch.rand(n, 3, generator=g) * 1.6 - 0.8
     visible = (torch.rand(n, views, generator=g) < 0.5).float()
-    return (t.to(device) for t in (points, visible, normalize(torch.randn(n, 3, generator=g), dim=-1)))
+    normal = normalize(torch.randn(n, 3, generator=g), dim=-1)
+    return points.to(device), *((visible.to(device), normal.to(device)) if on_surface else (None, None))
 
 
 def unlit(maps: ViewMaps, points, visible, normal):
@@ -60,25 +62,16 @@ def unlit(maps: ViewMaps, points, visible, normal):
     weight = view_weight / view_weight.sum(1, keepdim=True)
     color = (own[..., :3] * weight[..., None]).sum(1)
     spread = ((own[..., :3] - color[:, None]) ** 2 * weight[..., None]).sum(1).mean(-1, keepdim=True).sqrt()
-    return (
-        own,
-        weight,
-        torch.cat([color, spread, own[..., 3].amin(1)[:, None], view_weight.amax(1)[:, None], points.double()], -1),
-    )
+    summary = color, spread, own[..., 3].amin(1)[:, None], view_weight.amax(1)[:, None], points.double()
+    return own, weight, torch.cat(summary, -1)
 
 
 @pytest.mark.parametrize("views", [1, 3, 16])
 @pytest.mark.parametrize("on_surface", [False, True])
 def test_the_kernel_matches_torch(device, views, on_surface):
     maps = rig(views, device)
-    points, visible, normal = surface(700, views, device)
-    if not on_surface:
-        visible = normal = None
-    got, expected = (
-        summarize_views(maps.images, maps.camera, points, visible, normal),
-        unlit(maps, points, visible, normal),
-    )
-    for g, w in zip(got, expected, strict=True):
+    of_points = surface(700, views, device, on_surface)
+    for g, w in zip(summarize_views(maps.images, maps.camera, *of_points), unlit(maps, *of_points), strict=True):
         # projection in float32: errors of 1e-5 pixel on values that change by up to 12 per pixel; 0.2 % of them are
         # divided by EDGE_WIDTH * SIZE
         torch.testing.assert_close(g.double(), w, rtol=1e-4, atol=5e-4)
@@ -124,14 +117,11 @@ def test_half_of_the_arguments_of_a_surface_is_an_error(device):
 def test_the_fused_pass_equals_the_differentiable_one(device, views, on_surface):
     torch.manual_seed(0)
     maps, module = rig(views, device), ViewFeatures(WIDTH).to(device)
-    points, visible, normal = surface(700, views, device)
-    if not on_surface:
-        visible = normal = None
-    slow = module(maps, points, visible, normal)
+    of_points = surface(700, views, device, on_surface)
+    slow = module(maps, *of_points)
     with torch.no_grad():
-        assert all(torch.equal(a, b) for a, b in zip(module(maps, points, visible, normal), slow, strict=True))
-    fast = module.fused(maps, points, visible, normal)
-    for a, b in zip(fast, slow, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(module(maps, *of_points), slow, strict=True))
+    for a, b in zip(module.fused(maps, *of_points), slow, strict=True):
         # float32 sums of 25 products in another order, and the kernel's SiLU, 4e-7 off
         torch.testing.assert_close(a, b, rtol=1e-5, atol=3e-6)
 

@@ -51,9 +51,6 @@ def test_normals_of_a_face_that_is_seen_from_behind_point_to_the_viewer(tmp_path
     for view in range(2):
         seen = sample["visible"][:, view] > 0
         assert float(((c2w[view, :3, 3] - position[seen]) * normal[seen]).sum(1).min()) > 0.0
-    ground = (
-        (position.abs() < torch.tensor([0.45, 1.0, 0.35])).all(1)
-        & (position[:, 1] < -0.14)
-        & (sample["visible"].amax(1) > 0)
-    )
+    ground = (position.abs() < torch.tensor([0.45, 1.0, 0.35])).all(1) & (position[:, 1] < -0.14)
+    ground &= sample["visible"].amax(1) > 0
     assert int(ground.sum()) > 1000 and float(normal[ground, 1].min()) > 0.99

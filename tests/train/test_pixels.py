@@ -160,9 +160,12 @@ def test_levels_are_trained_one_after_the_other(folder, tmp_path, capsys):
     assert main([str(folder), str(tmp_path / "64"), "--stage", "pixels", "--image-size", "64", *start]) == 0
     assert main([str(folder), str(tmp_path / "64"), "--export", str(tmp_path / "net.safetensors")]) == 2
     assert not (tmp_path / "net.safetensors").exists()
-    for other in (["--stage", "pixels", "--image-size", "128"], []):  # another level, another stage
+    capsys.readouterr()
+    finer = ["--stage", "pixels", "--image-size", "128"]
+    for other, expected in ((finer, "the same parameters, got one of others"), ([], "stage small, got one of pixels")):
         assert main([str(folder), str(tmp_path / "64"), *other, *start]) == 2
-        assert "name another output folder, and this file by --weights" in capsys.readouterr().err
+        remedy = "name another output folder, and this file by --weights"
+        assert f"expected a checkpoint of {expected}; {remedy}" in capsys.readouterr().err
     from_64, from_128 = (["--weights", str(tmp_path / name / "state.pt")] for name in ("64", "128"))
     assert main([str(folder), str(tmp_path / "128"), "--stage", "pixels", "--image-size", "128", *from_64, *start]) == 0
     assert main([str(folder), str(tmp_path / "all"), *from_128, *start]) == 0
