@@ -48,10 +48,8 @@ def learned(finest: int = 0) -> LocalReconstructor:
 
 
 def test_images_of_the_full_size_are_those_of_a_sample(files):
-    got, expected = (
-        read_views_reduced(files[0], 1),
-        load_sample(files[0], 6, 64, np.random.default_rng(0), augment=False),
-    )
+    got = read_views_reduced(files[0], 1)
+    expected = load_sample(files[0], 6, 64, np.random.default_rng(0), augment=False)
     for field in dataclasses.fields(TrainingViews):
         a, b = getattr(got, field.name), getattr(expected, field.name)
         torch.testing.assert_close(a, b, rtol=0, atol=1e-5, msg=field.name)
@@ -144,8 +142,8 @@ def test_an_object_without_a_whole_pixel_has_no_terms(files):
         torch.testing.assert_close(both[name], value, rtol=1e-3, atol=1e-5, msg=name)
 
 
-def test_every_view_of_a_drawn_object_is_read_once(folder):
-    files, cache = sorted(folder.glob("*.safetensors")), ViewCache(2)
+def test_every_view_of_a_drawn_object_is_read_once(files):
+    cache = ViewCache(2)
     group = draw_group(files, [(1, k) for k in range(3)], cache, max_views=4)
     assert sum(group.counts) == len(group.views.masks) == 18 and max(group.counts) <= 4
     again = draw_group(files, [(1, k) for k in range(3)], cache, max_views=4)

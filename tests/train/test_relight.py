@@ -134,15 +134,14 @@ def test_a_finish_is_the_same_for_pixels_and_points():
 
 def test_samples_are_relit_where_lights_are_given(sample, sky, tmp_path, monkeypatch):
     save_file(sample, tmp_path / "0.safetensors")
-    draw = lambda probability, lights: (  # noqa: E731
-        monkeypatch.setattr(batches, "RELIGHT_PROBABILITY", probability),
-        batches.load_sample(tmp_path / "0.safetensors", 2, 64, np.random.default_rng(5), lights=lights),
-    )[1]
+
+    def draw(probability, lights):
+        monkeypatch.setattr(batches, "RELIGHT_PROBABILITY", probability)
+        return batches.load_sample(tmp_path / "0.safetensors", 2, 64, np.random.default_rng(5), lights=lights)
+
     lights = sky[None]
     stored, never, always, again = draw(1.0, None), draw(0.0, lights), draw(1.0, lights), draw(1.0, lights)
-    assert torch.equal(
-        stored.images, batches.load_sample(tmp_path / "0.safetensors", 2, 64, np.random.default_rng(5)).images
-    )
+    assert torch.equal(stored.images, draw(0.0, None).images)  # without lights none are drawn
     assert float((never.view_depth - stored.view_depth).abs().max()) < 3.0  # another turn, the same object
     assert torch.equal(always.images, again.images) and torch.equal(always.light, again.light)
     assert not torch.equal(always.light, stored.light)
