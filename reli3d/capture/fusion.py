@@ -64,8 +64,8 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     The log odds of a pixel, object over background, compare a mixture of Gaussians of the object's colors with the
     plane's texture, or elsewhere with the colors around the object.  They give the log odds that a cell of a volume is
     occupied (Franco and Boyer 2005), on which all views have to agree.  From the second pass on, cells below
-    SHADOW_HEIGHT do not hide the plane, so that a contact shadow becomes a part of its texture.  GrabCut starts from
-    the log odds of the pixels and the volume's silhouettes.  The last pass has larger images.
+    SHADOW_HEIGHT do not hide the plane, so that a contact shadow becomes a part of its texture.  The last pass has
+    larger images, and GrabCut starts from its log odds of the pixels and the volume's silhouettes.
     """
     if scene.plane is None:
         return masks
@@ -90,11 +90,13 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
         high = occupied[:, 2] > min(SHADOW_HEIGHT[0] * (box[1] - box[0]).max(), SHADOW_HEIGHT[1] * box[1, 2])
         occupied = axes.apply(occupied)
         cover = [_silhouette(s, occupied[high], cell) for s in smalls]
-        inside = [_segmented(s, e, occupied, cell) for s, e in zip(smalls, evidence, strict=True)]
-    photos = [(v.photo.name, v.photo.pixels) for v in views]
-    return {
-        name: full_size(refined(image, mask), image.shape) for (name, image), mask in zip(photos, inside, strict=True)
-    }
+        odds = [_with_prior(s, e, occupied, cell) for s, e in zip(smalls, evidence, strict=True)]
+        inside = [np.uint8(255) * (o > 0) for o in odds]
+    result = {}
+    for view, small, o in zip(views, smalls, odds, strict=True):
+        mask = refined(view.photo.pixels, _segmented(small.image, o))
+        result[view.photo.name] = full_size(mask, view.photo.pixels.shape)
+    return result
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,7 @@ def _plane_samples(
     """Colors ``(V, len(v), len(u), 3)`` of points of the plane in each view, NaN where it does not show them or
     ``hidden`` is 2; and where it shows them and ``hidden`` is 0.
     """
-    grid = axes.apply(np.stack([*np.meshgrid(u, v), np.zeros((len(v), len(u)))], -1).reshape(-1, 3))
+    grid = axes.apply(np.stack([*np.meshgrid(u, v), np.zeros((len(v), len(u)))], -1).reshape(-1, 3)).astype(np.float32)
     samples = np.zeros((len(smalls), len(v), len(u), 3), np.float32)
     outside = np.zeros(samples.shape[:3], bool)
     for k, (small, values) in enumerate(zip(smalls, hidden, strict=True)):
@@ -223,12 +225,12 @@ class _Colors:
             self.parts.append((part.mean(0), np.linalg.inv(covariance).astype(np.float32), np.float32(constant)))
 
     def log_density(self, image: np.ndarray) -> np.ndarray:
-        flat = image.reshape(-1, 3).astype(np.float32)
-        found = np.full(len(flat), LOWEST_DENSITY, np.float32)
+        flat = np.ascontiguousarray(image.reshape(-1, 3).T, np.float32)
+        density = np.full(flat.shape[1], np.exp(LOWEST_DENSITY), np.float32)
         for middle, inverse, constant in self.parts:
-            away = flat - middle
-            found = np.logaddexp(found, constant - 0.5 * np.einsum("nk,nk->n", away @ inverse, away))
-        return found.reshape(image.shape[:2])
+            away = flat - middle[:, None]
+            density += np.exp(constant - 0.5 * (away * (inverse @ away)).sum(0))
+        return np.log(density).reshape(image.shape[:2])
 
 
 def _evidence(
@@ -269,35 +271,40 @@ def shown_pixels(
 
 
 def _occupied(smalls, evidence, axes: Frame, box, points, cells: int, growth: float) -> tuple[np.ndarray, float]:
-    """Centers ``(N, 3)``, in ``axes``, of the occupied cells connected to ``points``, and their size."""
-    middle, side = box.mean(0), growth * float((box[1] - box[0]).max())
-    middle[2] = max(middle[2], side / 2 - 0.05 * side)  # hardly any of it below the plane
-    cell = side / cells
-    at = (np.arange(cells) + 0.5 - cells / 2) * cell
-    grid = np.stack(np.meshgrid(at, at, at, indexing="ij"), -1) + middle
-    flat = axes.apply(grid.reshape(-1, 3))
-    odds, seen = np.zeros(len(flat)), np.zeros(len(flat))
-    open_cells = (grid[..., 2].ravel() > 0).nonzero()[0]
+    """Centers ``(N, 3)``, in ``axes``, of the outermost cells of the occupied ones that are connected to ``points``,
+    and their size.
+    """
+    extent = box[1] - box[0]
+    cell = growth * float(extent.max()) / cells
+    margin = (growth - 1) / 2 * float(extent.max())
+    low, high = box[0] - margin, box[1] + margin
+    low[2] = max(low[2], 0.0)
+    shape = np.ceil((high - low) / cell).astype(int)
+    grid = low + (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1) + 0.5) * cell
+    flat = axes.apply(grid.reshape(-1, 3)).astype(np.float32)
+    index, odds, seen = np.arange(len(flat)), np.zeros(len(flat), np.float32), np.zeros(len(flat), np.float32)
     for k, (small, e) in enumerate(zip(smalls, evidence, strict=True), 1):
-        pixels, depth = small.project(flat[open_cells])
+        added = -np.log(COVERED + (1 - COVERED) * np.exp(-e))
+        pixels, depth = small.project(flat)
         x, y, shown = shown_pixels(pixels, depth, e.shape)
-        odds[open_cells[shown]] -= np.log(COVERED + (1 - COVERED) * np.exp(-e[y, x]))
-        seen[open_cells] += shown
+        odds[shown] += added[y, x]
+        seen += shown
         most_added = -np.log(COVERED) * (len(smalls) - k)  # by the views to come
-        open_cells = open_cells[odds[open_cells] + most_added > 0]
-    full = np.zeros(len(flat), bool)
-    full[open_cells] = seen[open_cells] >= LEAST_SEEN * len(smalls)
-    label, count = ndimage.label(full.reshape(grid.shape[:3]))
+        open_cells = odds > -most_added
+        index, flat, odds, seen = index[open_cells], flat[open_cells], odds[open_cells], seen[open_cells]
+    full = np.zeros(shape.prod(), bool)
+    full[index] = seen >= LEAST_SEEN * len(smalls)
+    label, count = ndimage.label(full.reshape(shape))
     if count == 0:
         return np.zeros((0, 3)), cell
-    index = np.floor((points - middle) / cell + cells / 2).astype(int)
-    index = index[((index >= 0) & (index < cells)).all(1)]
+    index = np.floor((points - low) / cell).astype(int)
+    index = index[((index >= 0) & (index < shape)).all(1)]
     votes = np.bincount(label[tuple(index.T)], minlength=count + 1)
     votes[0] = 0
     sizes = np.bincount(label.ravel(), minlength=count + 1)
     sizes[0] = 0
     best = votes.argmax() if votes.max() > 0 else sizes.argmax()
-    return grid[label == best], cell
+    return grid[(label == best) & ~ndimage.binary_erosion(label == best)], cell
 
 
 def _silhouette(small: _Small, centers: np.ndarray, cell: float) -> np.ndarray:
@@ -312,17 +319,21 @@ def _silhouette(small: _Small, centers: np.ndarray, cell: float) -> np.ndarray:
     return cv2.morphologyEx(silhouette, cv2.MORPH_CLOSE, np.ones((width, width), np.uint8))
 
 
-def _segmented(small: _Small, evidence: np.ndarray, occupied: np.ndarray, cell: float) -> np.ndarray:
-    """Mask ``(H, W)`` uint8 by GrabCut, which starts from the evidence and the silhouette of the occupied cells."""
+def _with_prior(small: _Small, evidence: np.ndarray, occupied: np.ndarray, cell: float) -> np.ndarray:
+    """``evidence`` plus log odds by the distance from the silhouette of the occupied cells; -inf far outside of it."""
     closed = _silhouette(small, occupied, cell)
     if not closed.any():
-        return closed
+        return np.full_like(evidence, -np.inf)
     away = cv2.distanceTransform(closed, cv2.DIST_L2, 3) - cv2.distanceTransform(255 - closed, cv2.DIST_L2, 3)
     away += 0.5 * small.view.focal * small.scale * cell / np.median(small.project(occupied)[1])  # cells, not centers
-    odds = evidence + np.clip(away, -PRIOR_OUTSIDE, PRIOR_INSIDE)
+    return np.where(away > -LIMIT_PIXELS, evidence + np.clip(away, -PRIOR_OUTSIDE, PRIOR_INSIDE), -np.inf)
+
+
+def _segmented(image: np.ndarray, odds: np.ndarray) -> np.ndarray:
+    """Mask ``(H, W)`` uint8 by GrabCut, which starts from the log odds of the pixels."""
+    limit = odds > -np.inf
     labels = np.where(odds > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     for certain, label in ((odds > CERTAIN, cv2.GC_FGD), (odds < -CERTAIN, cv2.GC_BGD)):
         labels[cv2.erode(certain.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0] = label
-    limit = (away > -LIMIT_PIXELS).astype(np.uint8)
-    labels[limit == 0] = cv2.GC_BGD
-    return grabcut(small.image, labels, limit)
+    labels[~limit] = cv2.GC_BGD
+    return grabcut(image, labels, limit)
