@@ -280,7 +280,8 @@ def _occupied(smalls, evidence, axes: Frame, box, points, cells: int, growth: fl
     low, high = box[0] - margin, box[1] + margin
     low[2] = max(low[2], 0.0)
     shape = np.ceil((high - low) / cell).astype(int)
-    grid = low + (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1) + 0.5) * cell
+    at = [start + (np.arange(n) + 0.5) * cell for start, n in zip(low, shape, strict=True)]
+    grid = np.stack(np.meshgrid(*at, indexing="ij"), -1)
     flat = axes.apply(grid.reshape(-1, 3)).astype(np.float32)
     index, odds, seen = np.arange(len(flat)), np.zeros(len(flat), np.float32), np.zeros(len(flat), np.float32)
     for k, (small, e) in enumerate(zip(smalls, evidence, strict=True), 1):
