@@ -93,8 +93,9 @@ def check_asset(asset: Asset) -> None:
                 raise ValueError(f"asset.mesh.{name}: expected unit length, got a length off by {worst:.3g}")
     if not bool((present("tangents", mesh.tangents)[:, 3].abs() == 1.0).all()):
         raise ValueError("asset.mesh.tangents: expected w = +1 or -1, got another value")
+    textures = present("asset.textures", asset.textures)
     for name in ("base_color", "roughness", "metallic", "normal"):
-        value = getattr(asset.textures, name)
+        value = getattr(textures, name)
         low, high = (float(v) for v in torch.aminmax(value)) if value.numel() else (-1.0, -1.0)
         if not 0.0 <= low <= high <= 1.0:  # NaN fails too
             raise ValueError(f"asset.textures.{name}: expected values in [0, 1], got others or none")

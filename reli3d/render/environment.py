@@ -52,9 +52,9 @@ class Environment(Movable):
     The upper edge is +Y, the horizontal center (the border of columns W/2 - 1 and W/2) is +X, and +Z is right of the
     center.  Methods: ``.lookup(directions)``, ``.rotated(yaw)`` [rad], ``.resized(height)``, ``.sample(u)``,
     ``.pdf(directions)``, ``.irradiance()``.  Gradients reach the texels.  ``radiance`` must not be modified in place:
-    the sampling CDF is kept, so in optimization construct a new Environment in every step.  Negative values are
-    rejected only when a file is written: optimize log radiance, or clamp.  Raises TypeError for a wrong dtype,
-    ValueError for a wrong shape.
+    the sampling CDF would be outdated (more noise), so in optimization construct a new Environment in every step.
+    Negative values are rejected only when a file is written: optimize log radiance, or clamp.  Raises TypeError for a
+    wrong dtype, ValueError for a wrong shape.
 
     >>> light = reli3d.Environment(torch.rand(16, 32, 3))
     >>> radiance = light.rotated(0.5).lookup(torch.tensor([0.0, 1.0, 0.0]))

@@ -58,7 +58,7 @@ def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") 
 
     wo: ``(..., 3)`` unit, local frame, z > 0, else density 0.  alpha: ``roughness**2``.  u: ``(..., 2)`` uniform in [0,
     1).  lobe: ``visible`` (``wo`` reflected about a visible normal), ``mirrored`` (about that normal turned by pi; only
-    with ``visible``, see the module) or ``cosine``.
+    together with ``visible``, by MIS) or ``cosine``.
 
     Gradients reach ``wo`` and ``alpha``.  Raises TypeError unless float32, ValueError for a wrong shape, device or
     lobe.  Source: Dupuy and Benyoub 2023.

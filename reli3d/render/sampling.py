@@ -59,7 +59,7 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
 def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
     """Density ``(...)`` [1/sr, in ``wm``] of :func:`sample_ggx_vndf`.
 
-    0 where ``wm`` faces away from ``wo``, and where either is below the surface.  wo, wm: ``(..., 3)`` unit, local
+    0 unless ``wm . wo``, ``wm.z`` and ``wo.z`` are positive.  wo, wm: ``(..., 3)`` unit, local
     frame.  alpha: tensor ``(...)``, GGX width ``roughness**2``.  Leading axes broadcast.  Gradients reach ``wo``,
     ``alpha`` and ``wm``.  Divide by ``4 wo.wm`` for the density of the reflected direction, which may be below the
     surface (where :func:`pdf_bsdf` is 0).  Raises TypeError unless float32, ValueError for a wrong shape or device.
@@ -77,9 +77,9 @@ def antithetic(u: Tensor) -> Tensor:
     """Random numbers ``(..., 2)`` of the antithetic partners of visible-normal samples drawn with ``u (..., 2)``.
 
     ``((u1 + 1/2) mod 1, 1 - 2^-24 - u2)``: the partner is on the opposite side of the lobe.  Uniform if ``u`` is.  For
-    multiples of 2^-24 the map is exact and its own inverse.  Averaging the pair reduces variance compared with two
-    independent samples if the integrand nearly changes sign between the partners, as do derivatives with respect to
-    ``alpha`` or the normal.  Samplers treat ``u`` as a constant, so gradients are not needed.  Raises TypeError unless
+    multiples of 2^-24 the map is exact and its own inverse.  The mean of a pair has less variance than that of two
+    independent samples if the partners' values are negatively correlated, as are derivatives with respect to ``alpha``
+    or the normal.  Samplers treat ``u`` as a constant, so gradients are not needed.  Raises TypeError unless
     float32, ValueError for a wrong shape.
 
     >>> partners = reli3d.antithetic(u)

@@ -65,13 +65,13 @@ class Samples(NamedTuple):
 class ShadeOptions:
     """Options of :func:`shade`: sampling and material model; raises ValueError, or TypeError for a wrong type.
 
-    samples: :class:`Samples`, or three counts.  seed: of the noise; change it in every step of an optimization.  A loss
-    of one image is biased; use the product of two seeds' residuals.  antithetic: pairs of visible-normal samples:
-    ``opposite`` (see :func:`reli3d.antithetic`), ``mirrored`` (ReLi3D), ``none``.  heuristic: ``balance`` or
-    ``power``.  sequence: ``halton``, rotated per point and strategy, or ``random``.  alpha: GGX width, ``squared``
-    roughness or, as in ReLi3D, ``linear``.  diffuse_model: see :func:`reli3d.eval_bsdf`.  clamp: limit per channel of a
-    sample's contribution, MIS weight included.  check_inputs: ValueError for unnormalized directions, materials outside
-    [0, 1], non-finite values.
+    samples: :class:`Samples`, or three counts, 0 for none.  seed: of the noise; change it in every step of an
+    optimization.  The squared residual of one noisy image is biased; multiply the residuals of two seeds.  antithetic:
+    pairs of visible-normal samples: ``opposite`` (see :func:`reli3d.antithetic`), ``mirrored`` (ReLi3D), ``none``.
+    heuristic: ``balance`` or ``power``.  sequence: ``halton``, rotated per point and strategy, or ``random``.  alpha:
+    GGX width, ``squared`` roughness or, as in ReLi3D, ``linear``.  diffuse_model: see :func:`reli3d.eval_bsdf`.  clamp:
+    limit per channel of a sample's contribution, MIS weight included.  check_inputs: ValueError for unnormalized
+    directions, materials outside [0, 1], non-finite values.
 
     >>> fast = reli3d.ShadeOptions(samples=(4, 4, 2), seed=1)
     >>> image = reli3d.render_asset(asset, camera, light, options=fast)
@@ -121,9 +121,9 @@ def shade(
     faces.  scene: occluders; None: no shadows.  pixels: ``(N,)`` int32, seeds each point's samples with
     ``options.seed``; None: the row.  Non-finite inputs give NaN.
 
-    Gradients, once differentiable, reach normal (its orthogonal part counts), base_color, roughness, metallic and the
-    environment's texels, at constant directions, densities, MIS weights and visibility.  Bitwise reproducible.  Raises
-    TypeError for a wrong type or dtype, ValueError for a wrong shape or device.  Source: Veach and Guibas 1995;
+    Gradients, once differentiable, reach normal (its part orthogonal to the normal), base_color, roughness, metallic
+    and the environment's texels, at constant directions, densities, MIS weights and visibility.  Bitwise reproducible.
+    Raises TypeError for a wrong type or dtype, ValueError for a wrong shape or device.  Source: Veach and Guibas 1995;
     :func:`reli3d.eval_bsdf`.
 
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)

@@ -290,6 +290,8 @@ def test_indices_and_nan_in_the_buffer_are_refused_and_limits_kept(asset, tmp_pa
 
 
 def test_missing_parts_of_an_asset_are_named(asset, tmp_path):
+    with pytest.raises(ValueError, match=r"^asset\.textures: expected a value, got None"):
+        write_glb(tmp_path / "a.glb", replace(asset, textures=None))
     for change, words in (
         ({"faces": asset.mesh.faces[:0]}, "faces: expected at least one face"),
         ({"tangents": None}, "tangents: expected a tensor, got None"),
