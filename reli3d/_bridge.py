@@ -419,7 +419,8 @@ def check(
     if not isinstance(value, Tensor):
         raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}")
     if value.dtype != dtype:
-        raise TypeError(f"{name}: expected {dtype}, got {value.dtype}")
+        remedy = "; round it to float32" if (dtype, value.dtype) == (torch.float32, torch.float64) else ""
+        raise TypeError(f"{name}: expected {dtype}, got {value.dtype}{remedy}")
     if last is not None and (value.ndim == 0 or value.shape[-1] != last):
         raise ValueError(f"{name}: expected shape (..., {last}), got {tuple(value.shape)}")
     if shape is not None:

@@ -25,9 +25,10 @@ class Mesh(Movable):
 
     vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32, counter-clockwise seen from outside.  normals: ``(V, 3)``
     unit.  uv: ``(V, 2)``, u right, v down, as glTF.  tangents: ``(V, 4)`` unit, w = +-1, bitangent = w cross(normal,
-    tangent).  colors: ``(V, 3)`` linear factors of the base color.  NumPy arrays are converted, float64 rounded; so are
-    other integer types.  Methods: ``.with_normals()``, ``.with_tangents()``.  Gradients pass through.  Raises TypeError
-    for a wrong dtype, ValueError for a wrong shape or device, or a face index out of range.
+    tangent).  colors: ``(V, 3)`` linear factors of the base color.  NumPy arrays and other integer types are converted;
+    float64, as in trimesh, must be rounded to float32 before.  Methods: ``.with_normals()``, ``.with_tangents()``.
+    Gradients pass through.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device, or a face index
+    out of range.
 
     >>> triangle = reli3d.Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
     >>> scene = reli3d.RayScene(triangle)
@@ -42,10 +43,8 @@ class Mesh(Movable):
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            value, kind = getattr(self, f.name), torch.int32 if f.name == "faces" else torch.float32
-            if isinstance(value, np.ndarray) and value.dtype == np.float64:
-                value = value.astype(np.float32)  # trimesh has float64
-            object.__setattr__(self, f.name, tensor_of(value, kind))
+            kind = torch.int32 if f.name == "faces" else torch.float32
+            object.__setattr__(self, f.name, tensor_of(getattr(self, f.name), kind))
         check_topology(self.vertices, self.faces)
         for name, last in (("normals", 3), ("uv", 2), ("tangents", 4), ("colors", 3)):
             value = getattr(self, name)
