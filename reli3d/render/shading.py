@@ -121,7 +121,7 @@ def shade(
     faces.  scene: occluders; None: no shadows.  pixels: ``(N,)`` int32, seeds each point's samples with
     ``options.seed``; None: the row.  Non-finite inputs give NaN.
 
-    Gradients, once differentiable, reach normal (its part orthogonal to the normal), base_color, roughness, metallic
+    Gradients, once differentiable, reach normal (its tangential component), base_color, roughness, metallic
     and the environment's texels, at constant directions, densities, MIS weights and visibility.  Bitwise reproducible.
     Raises TypeError for a wrong type or dtype, ValueError for a wrong shape or device.  Source: Veach and Guibas 1995;
     :func:`reli3d.eval_bsdf`.
