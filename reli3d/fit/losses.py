@@ -33,7 +33,7 @@ class Weights:
     hue: float = 0.1  # of :func:`hue_drift`
     base_coarse: float = 0.02  # pulls the base color's coarse field to the start; divided by the number of views
     base_color: float = 20.0  # of :func:`near_base_color`; over the 4th power of the number of views with used colors
-    finish: float = 0.1  # pulls roughness and metallic to the start; divided by the squared number of views
+    finish: float = 0.05  # pulls roughness and metallic to the start; divided by the number of views
     light: float = 3e-3  # pulls the lighting to the start
     light_variation: float = 2e-3  # of :func:`total_variation` of the lighting
     exposure: float = 0.1  # of squared log exposures; their mean is ambiguous with the scale of the lighting
@@ -130,12 +130,11 @@ def hue_drift(color: Tensor, start: Tensor) -> Tensor:
 def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
     """Priors that pull material, lighting and exposures to the start.
 
-    The base color's is divided by ``views``, that of roughness and metallic by ``views**2``.  The lighting's are
-    multiplied by ``(LIGHT_PRIOR_VIEWS / n)**2`` if the number n of views per lighting exceeds it: a lighting smoother
-    than the true one biases roughness upwards.
+    The material's are divided by ``views``.  The lighting's are multiplied by ``(LIGHT_PRIOR_VIEWS / n)**2`` if the
+    number n of views per lighting exceeds it: a lighting smoother than the true one biases roughness upwards.
     """
     base, finish = ([grid[..., part] for grid in unknowns.material] for part in (slice(0, 3), slice(3, 5)))
-    loss = weights.base_coarse / views * near_start(base) + weights.finish / views**2 * near_start(finish)
+    loss = weights.base_coarse / views * near_start(base) + weights.finish / views * near_start(finish)
     variation = torch.stack([total_variation(m) for m in light_maps(unknowns.light)]).sum()
     light = weights.light * near_start(unknowns.light) + weights.light_variation * variation
     loss = loss + min(1.0, LIGHT_PRIOR_VIEWS * len(unknowns.light[0]) / views) ** 2 * light
