@@ -279,7 +279,7 @@ def _occupied(smalls, evidence, axes: Frame, box, points, cells: int, growth: fl
     margin = (growth - 1) / 2 * float(extent.max())
     low, high = box[0] - margin, box[1] + margin
     low[2] = max(low[2], 0.0)
-    shape = np.ceil((high - low) / cell).astype(int)
+    shape = np.ceil((high - low) / cell).astype(int).clip(min=1)
     at = [start + (np.arange(n) + 0.5) * cell for start, n in zip(low, shape, strict=True)]
     grid = np.stack(np.meshgrid(*at, indexing="ij"), -1)
     flat = axes.apply(grid.reshape(-1, 3)).astype(np.float32)
