@@ -205,9 +205,9 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
         pycolmap.match_sequential(database, matching, pairing, verification)
     options = pycolmap.IncrementalPipelineOptions(min_model_size=3, random_seed=SEED, extract_colors=False)
     options.num_threads = 1  # else the first pair of images depends on the threads, where few pairs are good
-    if known:
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not known
+    # Features inside masks do not tell distortion from another focal length (k1 = -0.7 and a focal length 7 % off).
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = masks is None and not known
     if relaxed:
         options.mapper.init_min_num_inliers = 50
         options.mapper.init_min_tri_angle = 8.0
