@@ -229,8 +229,23 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
     options.min_num_matches = verification.min_num_inliers = 1
     pycolmap.guided_geometric_verification(largest, database, two_view_geometry_options=verification)
     largest = pycolmap.triangulate_points(largest, database, images, work / "sparse", options=options)
+    _adjust(largest, options.get_global_bundle_adjustment())
     with pycolmap.Database.open(database) as data:
         return _read_model(largest, data, by_path, scales)
+
+
+def _adjust(model, options) -> None:
+    """Bundle adjustment of all points of ``model``, in place: `triangulate_points` adds points, but keeps the cameras.
+
+    pycolmap.bundle_adjustment does the same, but turns logging on.
+    """
+    pycolmap = _pycolmap()
+    problem = pycolmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        problem.add_image(number)
+    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, problem, model).solve()
+    model.update_point_3d_errors()
 
 
 def _write(path: Path, pixels: np.ndarray, scale: np.ndarray) -> None:
