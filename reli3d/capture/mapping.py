@@ -235,9 +235,9 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
 
 
 def _adjust(model, options) -> None:
-    """Bundle adjustment of all points of ``model``, in place: `triangulate_points` adds points, but keeps the cameras.
+    """Bundle adjustment of ``model``, in place, with the points that ``triangulate_points`` added to fixed cameras.
 
-    pycolmap.bundle_adjustment does the same, but turns logging on.
+    ``pycolmap.bundle_adjustment`` computes the same and turns COLMAP's logging on.
     """
     pycolmap = _pycolmap()
     problem = pycolmap.BundleAdjustmentConfig()

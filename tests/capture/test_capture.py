@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -78,10 +79,19 @@ def test_two_runs_write_equal_files(ground_truth, captured, tmp_path):
     assert all((folder / p).read_bytes() == (tmp_path / "object" / p).read_bytes() for p in files)
 
 
-def test_features_inside_masks_do_not_estimate_distortion(ground_truth, tmp_path):
+def test_features_inside_masks_give_no_distortion_and_cameras_that_fit_all_points(ground_truth, tmp_path):
+    """OpenCV's descent from each camera, with the points fixed, stays there: 1e-7; 5e-3 without the last adjustment."""
     photos, _ = read_photos(ground_truth.write(tmp_path / "photographs"), lambda *_: None)
     found = map_photos(photos[:8], lambda *_: None, [np.uint8(255) * m for m in ground_truth.masks[:8]])
     assert max(abs(v.radial) for v in found.views) < 0.01  # the scene's is 0; estimated, it becomes -0.15
+    for v in found.views:
+        matrix = np.array([[v.focal, 0, v.principal[0]], [0, v.focal, v.principal[1]], [0, 0, 1]])
+        lens, turn = np.array([v.radial, 0, 0, 0]), cv2.Rodrigues(v.rotation)[0]
+        shift = v.translation[:, None]
+        start = turn.copy(), shift.copy()  # they are overwritten
+        fitted = cv2.solvePnPRefineLM(found.points[v.points], v.pixels, matrix, lens, *start)
+        assert np.abs(fitted[0] - turn).max() < 1e-5
+        assert np.abs(fitted[1] - shift).max() < 1e-5 * np.linalg.norm(shift)
 
 
 @pytest.mark.slow
