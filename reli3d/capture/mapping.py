@@ -229,7 +229,8 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
     options.min_num_matches = verification.min_num_inliers = 1
     pycolmap.guided_geometric_verification(largest, database, two_view_geometry_options=verification)
     largest = pycolmap.triangulate_points(largest, database, images, work / "sparse", options=options)
-    _adjust(largest, options.get_global_bundle_adjustment())
+    if masks is not None:  # few points: the added ones matter; without masks some may lie on what moves
+        _adjust(largest, options.get_global_bundle_adjustment())
     with pycolmap.Database.open(database) as data:
         return _read_model(largest, data, by_path, scales)
 
