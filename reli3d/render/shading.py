@@ -63,10 +63,10 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ShadeOptions:
-    """Options of :func:`shade`: sampling and material model; raises ValueError, or TypeError for a wrong type.
+    """Options of :func:`shade`: sampling and material model; raises ValueError or TypeError.
 
-    samples: :class:`Samples`, or three counts, 0 for none.  seed: of the noise; change it in every step of an
-    optimization.  The squared residual of one noisy image is biased; multiply the residuals of two seeds.  antithetic:
+    samples: :class:`Samples`, or three counts, 0 for none.  seed: of the noise; change it in every optimization
+    step.  The squared residual of one noisy image is biased; multiply the residuals of two seeds.  antithetic:
     pairs of visible-normal samples: ``opposite`` (see :func:`reli3d.antithetic`), ``mirrored`` (ReLi3D), ``none``.
     heuristic: ``balance`` or ``power``.  sequence: ``halton``, rotated per point and strategy, or ``random``.  alpha:
     GGX width, ``squared`` roughness or, as in ReLi3D, ``linear``.  diffuse_model: see :func:`reli3d.eval_bsdf`.  clamp:
