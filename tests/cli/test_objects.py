@@ -17,6 +17,7 @@ from reli3d.cli import infer, job, objects
 from reli3d.errors import InputError
 from tests.support.checkout import ROOT
 from tests.support.jobs import Start, WordJob
+from tests.support.processes import heed_signals
 
 WORDS = ["one", "crash once", "three", "refuse", "crash", "six", "fail", "eight", "nine", "crash once"]
 WITH_RAY = pytest.param("ray", marks=pytest.mark.slow)  # its cluster takes half a minute to start
@@ -142,6 +143,7 @@ def command(tmp_path, *arguments, code: str = "") -> subprocess.Popen:
         stderr=subprocess.PIPE,
         text=True,
         cwd=ROOT,
+        preexec_fn=heed_signals,
     )
 
 
