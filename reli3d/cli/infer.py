@@ -70,10 +70,10 @@ def checked_items(args: argparse.Namespace) -> list[objects.Item]:
 
 def _check_kept(item: objects.Item) -> None:
     """Raises InputError if the result would replace files of the input that have the names of a result."""
-    from reli3d.output.results import OURS
-
     if os.path.realpath(item.target) != os.path.realpath(item.folder) or (item.folder / "run_info.json").exists():
         return
+    from reli3d.output.results import OURS  # loads torch
+
     if found := [name for name in OURS if os.path.lexists(item.folder / name)]:
         raise InputError("--output", f"expected a place outside the input, as its {found[0]} would be replaced")
 
