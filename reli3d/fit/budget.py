@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 
 from tqdm import tqdm
 
+from reli3d._bridge import present
+
 
 @dataclass
 class Budget:
@@ -62,6 +64,12 @@ class Budget:
             yield count, progress
             count += 1
             self.counts[name] = count
+
+    def used(self) -> float:
+        """Fraction of the budget that is used."""
+        if self.steps is not None:
+            return sum(self.counts.values()) / self.steps
+        return (time.perf_counter() - self.began) / present("seconds", self.seconds)
 
     def record(self, name: str, step: int, loss: float) -> None:
         """Records the loss of a step in the curve and on the progress bar."""

@@ -61,7 +61,8 @@ class Fitted:
 
     first: the start.  surface: the fitted surface with the start's maps and lighting; ``first`` if the surface was not
     fitted.  received: ``(V, 3)``, from :func:`~reli3d.fit.bounce.gathered` at the vertices of ``surface``.  images:
-    with corrected cameras.
+    with corrected cameras.  material_start: ``surface`` with the maps that the changes of the material refer to; None:
+    those of ``surface``.
     """
 
     first: Asset
@@ -70,6 +71,7 @@ class Fitted:
     start: Start
     unknowns: Unknowns
     images: InputImages
+    material_start: Asset | None = None
 
     @torch.no_grad()
     def blended(self, material: float, light: float) -> Asset:
@@ -77,7 +79,8 @@ class Fitted:
         asset, unknowns = self.surface, self.unknowns
         if material:
             grids, bend = ([material * grid for grid in grids] for grids in (unknowns.material, unknowns.bend))
-            asset = changed(asset, replace(unknowns, material=grids, bend=bend, detail=material * unknowns.detail))
+            change = replace(unknowns, material=grids, bend=bend, detail=material * unknowns.detail)
+            asset = changed(self.material_start or asset, change)
         return replace(asset, environment=self.lights(light).of_view(0)) if light else asset
 
     def lights(self, weight: float) -> Lights:

@@ -18,6 +18,7 @@ from reli3d.fit.input_images import InputImages, PosedImages
 from reli3d.fit.light_frame import light_follows_camera
 from reli3d.fit.light_hue import CHROMATICITY_WEIGHT, with_neutral_light
 from reli3d.fit.maps import FixedSurface, fit_maps
+from reli3d.fit.material_start import best_material_start
 from reli3d.fit.shape import ShapeData, empty, finished, fit_shape, start_grid
 from reli3d.fit.transfer import transfer_textures
 from reli3d.fit.unknowns import START_GRID, Start, Unknowns, corrected, filled_grid
@@ -26,6 +27,7 @@ from reli3d.render.asset import Asset
 
 RESOLUTION = 128  # cells along the longest side
 LIGHT_UNTIL, SHAPE_UNTIL = 0.12, 0.5  # fractions of the budget: first the lighting, then the surface, then all maps
+MIN_HELD_FOR_TRIALS = 2  # held-out views: with fewer, their error shows little about the material
 MIN_ATLAS_TEXELS = 256  # along a side of the new surface's textures: smaller ones have no room for its charts
 MAX_DETAIL_TEXELS = 512  # along a side of the base color's detail map
 UV_TOLERANCE = 1e-3  # beyond [0, 1]; within a texel
@@ -186,8 +188,13 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
             data = FixedSurface(start, surface, received, images, used)
     else:
         notes.append("refinement: the surface is not closed, so only maps and lighting are fitted")
+    surface, held = data.asset, [v for v in range(len(images)) if v not in used]
+    if len(held) >= MIN_HELD_FOR_TRIALS:
+        unknowns, data = best_material_start(unknowns, data, held, weights, budget, seed=seed)
+        if data.asset is not surface:
+            notes.append("refinement: roughness and metallic are fitted from those of a glossy nonmetal")
     fit_maps(unknowns, data, weights, budget, "maps", 1.0, seed=seed)
-    return Fitted(first, data.asset, data.received, start, unknowns, images)
+    return Fitted(first, surface, data.received, start, unknowns, images, data.asset)
 
 
 def _check_asset(asset: Asset, images: InputImages) -> None:

@@ -1,0 +1,39 @@
+"""The maps of glossy nonmetals are not fitted from a rough and half metallic start; those of metals are."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from reli3d.fit.bounce import gathered
+from reli3d.fit.budget import Budget
+from reli3d.fit.input_images import InputImages
+from reli3d.fit.losses import Weights
+from reli3d.fit.maps import FixedSurface
+from reli3d.fit.material_start import best_material_start
+from reli3d.fit.unknowns import Start, Unknowns
+from reli3d.render.environment import Environment
+from tests.support import small_scene
+
+VIEWS, SIZE, TRIAL_STEPS = 12, 40, 60
+
+
+def lamps() -> Environment:
+    radiance = 0.3 * small_scene.sky().radiance
+    for row, column in ((3, 5), (5, 18), (8, 27)):
+        radiance[row, column] = 40.0
+    return Environment(radiance)
+
+
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_a_glossy_nonmetal_is_found_and_a_metal_is_not_taken_for_one(metallic):
+    true = small_scene.two_colored(small_scene.ball())
+    true = replace(true, environment=lamps(), textures=replace(true.textures, roughness=0.25, metallic=metallic))
+    images = InputImages.of(small_scene.input_views(true, VIEWS, SIZE))
+    start = small_scene.ball()
+    start = replace(start, textures=replace(start.textures, roughness=0.7, metallic=0.5))
+    unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
+    used, held = [v for v in range(VIEWS) if v % 6], [0, 6]
+    data = FixedSurface(Start.of(start), start, gathered(start.mesh, images, seed=0), images, used)
+    _, best = best_material_start(unknowns, data, held, Weights(), Budget(steps=10 * TRIAL_STEPS), seed=0)
+    assert (best is data) == bool(metallic)
