@@ -1,7 +1,8 @@
-"""Roughness and metallic from which the maps are fitted: those of the start, or constants if they fit as well."""
+"""Roughness and metallic from which the maps are fitted: those of the start or of a glossy metal or nonmetal."""
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 from dataclasses import replace
 
@@ -13,27 +14,28 @@ from reli3d.fit.maps import PIXELS_PER_STEP, SHADING_SAMPLES, FixedSurface, fit_
 from reli3d.fit.unknowns import Unknowns
 from reli3d.geometry.rays import RayScene
 
-ROUGHNESS, METALLIC = 0.25, 0.05  # a glossy nonmetal
-TRIAL = 0.1  # fraction of the budget for each of the two fits
+ROUGHNESS, METAL, NONMETAL = 0.25, 0.95, 0.05
+TRIAL = 0.08  # fraction of the budget for each of the three fits
 # Ratio of errors up to which the nonmetal is preferred: metals fit images of nonmetals almost as well, by a base color
-# and a lighting that are both wrong.  On six meshes and 14 views the ratio is 0.98 to 1.03 for nonmetals, 1.11 and 1.17
-# for a rough crate and a metal.
+# and a lighting that are both wrong.  It is 0.95 to 1.04 for four meshes of glossy nonmetals, 1.08 to 1.29 for others.
 PREFERENCE = 1.05
-MIN_STEPS = 40  # of each fit; after fewer, the start that needs fewer changes has the smaller error
+MIN_STEPS = 30  # of each fit; after fewer, the start that needs fewer changes has the smaller error
 MIN_BASE_COLOR = 0.02
 CHECK_BATCHES = 4
 IMAGE_ONLY = losses.Weights(**{name: float(name == "image") for name in vars(losses.Weights())})
 
 
-def nonmetal(data: FixedSurface) -> FixedSurface:
-    """``data`` with constant roughness and metallic; the diffuse albedo stays."""
+def with_metallic(data: FixedSurface, metallic: float) -> FixedSurface:
+    """``data`` with constant roughness and metallic; the diffuse albedo of a nonmetal stays that of ``data``."""
     maps = data.asset.textures
-    base_color = maps.base_color * ((1.0 - maps.metallic) / (1.0 - METALLIC))[..., None]
+    base_color = maps.base_color
+    if metallic < 0.5:
+        base_color = base_color * ((1.0 - maps.metallic) / (1.0 - metallic))[..., None]
     textures = replace(
         maps,
         base_color=base_color.clamp(MIN_BASE_COLOR, 1.0),
         roughness=torch.full_like(maps.roughness, ROUGHNESS),
-        metallic=torch.full_like(maps.metallic, METALLIC),
+        metallic=torch.full_like(maps.metallic, metallic),
     )
     return replace(data, asset=replace(data.asset, textures=textures))
 
@@ -53,24 +55,23 @@ def image_error(unknowns: Unknowns, data: FixedSurface, views: list[int], seed: 
 def best_material_start(
     unknowns: Unknowns, data: FixedSurface, held: list[int], weights: losses.Weights, budget: Budget, *, seed: int
 ) -> tuple[Unknowns, FixedSurface]:
-    """Fits the maps briefly from the start and from :func:`nonmetal`; returns the better fit and its data.
+    """Fits the maps briefly from the start, a glossy metal and a glossy nonmetal; returns the best fit and its data.
 
     From a rough or half metallic start, descent can end in a local minimum, with too high roughness and a lighting
     without highlights.  The error is the sum of the means over fitted views and over ``held``, indices of the held-out
-    views; the nonmetal's may be ``PREFERENCE`` times the other.  After fewer than ``MIN_STEPS`` steps it is the start's
-    fit.  seed: of pixels and light samples.
+    views; the nonmetal's may be ``PREFERENCE`` times the others'.  After fewer than ``MIN_STEPS`` steps of a fit the
+    next ones are left out.  seed: of pixels and light samples.
     """
-    began, error = budget.used(), 0.0
-    other = deepcopy(unknowns)
-    for grid in other.material:
+    plain = deepcopy(unknowns)
+    for grid in plain.material:
         grid[..., 3:] = 0.0
-    fits = {"trial of start": (unknowns, data), "trial of nonmetal": (other, nonmetal(data))}
-    best = unknowns, data
-    for k, (name, fit) in enumerate(fits.items()):
-        fit_maps(*fit, weights, budget, name, began + (k + 1) * TRIAL, seed=seed)
-        if budget.counts[name] < MIN_STEPS:
+    best, error = (unknowns, data), math.inf
+    for name, metallic in (("start", None), ("metal", METAL), ("nonmetal", NONMETAL)):
+        fit = (unknowns, data) if metallic is None else (deepcopy(plain), with_metallic(data, metallic))
+        fit_maps(*fit, weights, budget, f"trial of {name}", budget.used() + TRIAL, seed=seed)
+        if budget.counts[f"trial of {name}"] < MIN_STEPS:
             break
         found = sum(image_error(*fit, views, seed) for views in (data.used, held))
-        if k == 0 or found <= PREFERENCE * error:
+        if found <= error * (PREFERENCE if metallic == NONMETAL else 1.0):
             best, error = fit, found
     return best

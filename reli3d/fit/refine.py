@@ -192,7 +192,8 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
     if len(held) >= MIN_HELD_FOR_TRIALS:
         unknowns, data = best_material_start(unknowns, data, held, weights, budget, seed=seed)
         if data.asset is not surface:
-            notes.append("refinement: roughness and metallic are fitted from those of a glossy nonmetal")
+            kind = "metal" if float(data.asset.textures.metallic.mean()) > 0.5 else "nonmetal"
+            notes.append(f"refinement: roughness and metallic are fitted from those of a glossy {kind}")
     fit_maps(unknowns, data, weights, budget, "maps", 1.0, seed=seed)
     return Fitted(first, surface, data.received, start, unknowns, images, data.asset)
 

@@ -15,7 +15,7 @@ from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.render.environment import Environment
 from tests.support import small_scene
 
-VIEWS, SIZE, TRIAL_STEPS = 12, 40, 60
+VIEWS, SIZE, STEPS = 12, 32, 400
 
 
 def lamps() -> Environment:
@@ -30,10 +30,10 @@ def test_a_glossy_nonmetal_is_found_and_a_metal_is_not_taken_for_one(metallic):
     true = small_scene.two_colored(small_scene.ball())
     true = replace(true, environment=lamps(), textures=replace(true.textures, roughness=0.25, metallic=metallic))
     images = InputImages.of(small_scene.input_views(true, VIEWS, SIZE))
-    start = small_scene.ball()
-    start = replace(start, textures=replace(start.textures, roughness=0.7, metallic=0.5))
+    textures = replace(true.textures, roughness=0.7, metallic=0.5)
+    start = replace(true, environment=small_scene.ball().environment, textures=textures)
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
     used, held = [v for v in range(VIEWS) if v % 6], [0, 6]
     data = FixedSurface(Start.of(start), start, gathered(start.mesh, images, seed=0), images, used)
-    _, best = best_material_start(unknowns, data, held, Weights(), Budget(steps=10 * TRIAL_STEPS), seed=0)
-    assert (best is data) == bool(metallic)
+    _, best = best_material_start(unknowns, data, held, Weights(), Budget(steps=STEPS), seed=0)
+    assert (float(best.asset.textures.metallic.mean()) < 0.1) == (metallic == 0.0)
