@@ -62,6 +62,8 @@ def best_material_start(
     views; the nonmetal's may be ``PREFERENCE`` times the others'.  After fewer than ``MIN_STEPS`` steps of a fit the
     next ones are left out.  seed: of pixels and light samples.
     """
+    if budget.steps is not None and TRIAL * budget.steps < MIN_STEPS:
+        return unknowns, data
     plain = deepcopy(unknowns)
     for grid in plain.material:
         grid[..., 3:] = 0.0

@@ -15,7 +15,7 @@ from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.render.environment import Environment
 from tests.support import small_scene
 
-VIEWS, SIZE, STEPS = 12, 32, 400
+VIEWS, SIZE, STEPS = 12, 24, 400
 
 
 def lamps() -> Environment:
