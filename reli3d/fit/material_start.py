@@ -16,8 +16,9 @@ from reli3d.geometry.rays import RayScene
 
 ROUGHNESS, METAL, NONMETAL = 0.25, 0.95, 0.05
 TRIAL = 0.08  # fraction of the budget for each of the three fits
-# Ratio of errors up to which the nonmetal is preferred: metals fit images of nonmetals almost as well, by a base color
-# and a lighting that are both wrong.  It is 0.95 to 1.04 for four meshes of glossy nonmetals, 1.08 to 1.29 for others.
+# Ratio of errors up to which the nonmetal is preferred to the start: half metals fit images of nonmetals almost as
+# well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for glossy nonmetals, 1.10 to 1.29 for
+# others, but 0.99 for a painted metal, which the metal fits best.
 PREFERENCE = 1.05
 MIN_STEPS = 30  # of each fit; after fewer, the start that needs fewer changes has the smaller error
 MIN_BASE_COLOR = 0.02
@@ -59,7 +60,7 @@ def best_material_start(
 
     From a rough or half metallic start, descent can end in a local minimum, with too high roughness and a lighting
     without highlights.  The error is the sum of the means over fitted views and over ``held``, indices of the held-out
-    views; the nonmetal's may be ``PREFERENCE`` times the others'.  After fewer than ``MIN_STEPS`` steps of a fit the
+    views; the nonmetal's may be ``PREFERENCE`` times the start's.  After fewer than ``MIN_STEPS`` steps of a fit the
     next ones are left out.  seed: of pixels and light samples.
     """
     if budget.steps is not None and TRIAL * budget.steps < MIN_STEPS:
@@ -74,6 +75,6 @@ def best_material_start(
         if budget.counts[f"trial of {name}"] < MIN_STEPS:
             break
         found = sum(image_error(*fit, views, seed) for views in (data.used, held))
-        if found <= error * (PREFERENCE if metallic == NONMETAL else 1.0):
+        if found <= error * (PREFERENCE if metallic == NONMETAL and best[1] is data else 1.0):
             best, error = fit, found
     return best
