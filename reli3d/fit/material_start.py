@@ -18,7 +18,7 @@ ROUGHNESS, METAL, NONMETAL = 0.25, 0.95, 0.05
 TRIAL = 0.08  # fraction of the budget for each of the three fits
 # Ratio of errors up to which the nonmetal is preferred to the start: half metals fit images of nonmetals almost as
 # well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for glossy nonmetals, 1.10 to 1.29 for
-# others, but 0.99 for a painted metal, which the metal fits best.
+# others, but 0.99 to 1.02 for a painted metal, whose images all three fit equally.
 PREFERENCE = 1.05
 MIN_STEPS = 30  # of each fit; after fewer, the start that needs fewer changes has the smaller error
 MIN_BASE_COLOR = 0.02
