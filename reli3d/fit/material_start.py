@@ -14,11 +14,12 @@ from reli3d.fit.maps import PIXELS_PER_STEP, SHADING_SAMPLES, FixedSurface, fit_
 from reli3d.fit.unknowns import Unknowns
 from reli3d.geometry.rays import RayScene
 
-ROUGHNESS, METAL, NONMETAL = 0.25, 0.95, 0.05
+TRIAL_ROUGHNESS = 0.25
+TRIAL_METALLIC = {"metal": 0.95, "nonmetal": 0.05}
 TRIAL = 0.08  # fraction of the budget for each of the three fits
-# Ratio of errors up to which the nonmetal is preferred to the start: half metals fit images of nonmetals almost as
-# well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for glossy nonmetals, 1.10 to 1.29 for
-# others, but 0.99 to 1.02 for a painted metal, whose images all three fit equally.
+# Ratio to the start's error up to which the nonmetal is preferred if it fits better than the metal: half metals fit
+# images of nonmetals almost as well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for glossy
+# nonmetals, 1.10 to 1.29 for others; for a painted metal 0.99 to 1.02, but the metal fits better there.
 PREFERENCE = 1.05
 MIN_STEPS = 30  # of each fit; after fewer, the start that needs fewer changes has the smaller error
 MIN_BASE_COLOR = 0.02
@@ -35,7 +36,7 @@ def with_metallic(data: FixedSurface, metallic: float) -> FixedSurface:
     textures = replace(
         maps,
         base_color=base_color.clamp(MIN_BASE_COLOR, 1.0),
-        roughness=torch.full_like(maps.roughness, ROUGHNESS),
+        roughness=torch.full_like(maps.roughness, TRIAL_ROUGHNESS),
         metallic=torch.full_like(maps.metallic, metallic),
     )
     return replace(data, asset=replace(data.asset, textures=textures))
@@ -60,21 +61,22 @@ def best_material_start(
 
     From a rough or half metallic start, descent can end in a local minimum, with too high roughness and a lighting
     without highlights.  The error is the sum of the means over fitted views and over ``held``, indices of the held-out
-    views; the nonmetal's may be ``PREFERENCE`` times the start's.  After fewer than ``MIN_STEPS`` steps of a fit the
-    next ones are left out.  seed: of pixels and light samples.
+    views.  The nonmetal's may be ``PREFERENCE`` times the start's if it is below the metal's.  After fewer than
+    ``MIN_STEPS`` steps of a fit the next ones are left out.  seed: of pixels and light samples.
     """
     if budget.steps is not None and TRIAL * budget.steps < MIN_STEPS:
         return unknowns, data
     plain = deepcopy(unknowns)
     for grid in plain.material:
         grid[..., 3:] = 0.0
-    best, error = (unknowns, data), math.inf
-    for name, metallic in (("start", None), ("metal", METAL), ("nonmetal", NONMETAL)):
-        fit = (unknowns, data) if metallic is None else (deepcopy(plain), with_metallic(data, metallic))
-        fit_maps(*fit, weights, budget, f"trial of {name}", budget.used() + TRIAL, seed=seed)
+    fits, errors = {"start": (unknowns, data)}, dict.fromkeys(("start", *TRIAL_METALLIC), math.inf)
+    for name in errors:
+        if name in TRIAL_METALLIC:
+            fits[name] = deepcopy(plain), with_metallic(data, TRIAL_METALLIC[name])
+        fit_maps(*fits[name], weights, budget, f"trial of {name}", budget.used() + TRIAL, seed=seed)
         if budget.counts[f"trial of {name}"] < MIN_STEPS:
             break
-        found = sum(image_error(*fit, views, seed) for views in (data.used, held))
-        if found <= error * (PREFERENCE if metallic == NONMETAL and best[1] is data else 1.0):
-            best, error = fit, found
-    return best
+        errors[name] = sum(image_error(*fits[name], views, seed) for views in (data.used, held))
+    if errors["nonmetal"] < errors["metal"]:
+        errors["nonmetal"] /= PREFERENCE
+    return fits[min(errors, key=lambda name: errors[name])]
