@@ -86,7 +86,7 @@ class Asset(Movable):
     """
 
     mesh: Mesh
-    textures: TextureSet
+    textures: TextureSet = None  # type: ignore[assignment] # without: a gray dielectric
     environment: Environment | None = None
 
     def __post_init__(self):

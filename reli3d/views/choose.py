@@ -24,9 +24,9 @@ def view_distances(c2w: Tensor) -> tuple[Tensor, Tensor]:
     poses = c2w.double().cpu()
     eyes, axes = poses[:, :3, 3], -poses[:, :3, 2]
     one = torch.eye(3, dtype=axes.dtype, device=axes.device)
-    beside = one - axes[:, :, None] * axes[:, None]
-    right = (beside @ eyes[..., None]).mean(0)[:, 0] + 1e-5 * meeting_point(eyes, axes)[0]
-    away = eyes - torch.linalg.solve(beside.mean(0) + 1e-5 * one, right)  # a prior of 1e-5 of an axis at meeting_point
+    across_axis = one - axes[:, :, None] * axes[:, None]
+    right = (across_axis @ eyes[..., None]).mean(0)[:, 0] + 1e-5 * meeting_point(eyes, axes)[0]
+    away = eyes - torch.linalg.solve(across_axis.mean(0) + 1e-5 * one, right)  # prior: meeting_point
     length = away.norm(dim=-1).clamp_min(1e-12)
     to = away / length[:, None]
     across = torch.linalg.cross(to[:, None].expand(-1, len(to), -1), to[None].expand(len(to), -1, -1)).norm(dim=-1)

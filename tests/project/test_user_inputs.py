@@ -103,7 +103,7 @@ def test_an_asset_moves_detaches_and_prints_a_summary(device):
     assert on == {torch.device(device).type}
     assert moved.textures.base_color.requires_grad and not moved.detach().textures.base_color.requires_grad
     assert repr(asset) == "Asset(642 vertices, 1280 faces, 4 x 4 texels, environment 4 x 8, cpu)"
-    assert repr(Asset(asset.mesh, None)) == "Asset(642 vertices, 1280 faces, no textures, no environment, cpu)"
+    assert repr(Asset(asset.mesh)) == "Asset(642 vertices, 1280 faces, no textures, no environment, cpu)"
     assert repr(asset.textures) == "TextureSet(4 x 4 texels, cpu)"
     pose = look_at([0.0, 0.0, 3.0]).requires_grad_()
     camera = Camera.from_fov(pose, 0.7, 8, 8).to(device)
