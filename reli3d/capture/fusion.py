@@ -41,7 +41,8 @@ LEAST_SEEN = 0.5  # fraction of the views that must show a cell
 VOLUME_SIDE = 2.0, 1.15, 1.15  # sides of the volume over those of the object so far, in each pass
 PRIOR_INSIDE, PRIOR_OUTSIDE = 3.0, 6.0  # largest log odds by the distance in pixels from the volume's silhouette
 SHADOW_HEIGHT = 0.1, 0.4  # of the object's longest side and of its height: lower cells may be a shadow on the plane
-CERTAIN = 3.0  # log odds from which GrabCut keeps a pixel whose neighbors have them too: evidence is blurred
+CERTAIN_OBJECT = 3.0  # log odds from which GrabCut keeps a pixel whose neighbors have them too: evidence is blurred
+CERTAIN_BACKGROUND = 2.0  # the same of the background: GrabCut would add shadows of a color like the object
 LIMIT_PIXELS = 12  # around the silhouette: farther out nothing is the object
 
 
@@ -64,8 +65,8 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     The log odds of a pixel, object over background, compare a mixture of Gaussians of the object's colors with the
     plane's texture, or elsewhere with the colors around the object.  They give the log odds that a cell of a volume is
     occupied (Franco and Boyer 2005), on which all views have to agree.  From the second pass on, cells below
-    SHADOW_HEIGHT do not hide the plane, so that a contact shadow becomes a part of its texture.  The last pass has
-    larger images, and GrabCut starts from its log odds of the pixels and the volume's silhouettes.
+    SHADOW_HEIGHT do not hide the plane, so that a contact shadow becomes a part of its texture.  Each pass ends with
+    GrabCut from the log odds of the pixels and the volume's silhouettes; the last has larger images.
     """
     if scene.plane is None:
         return masks
@@ -91,12 +92,9 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
         occupied = axes.apply(occupied)
         cover = [_silhouette(s, occupied[high], cell) for s in smalls]
         odds = [_with_prior(s, e, occupied, cell) for s, e in zip(smalls, evidence, strict=True)]
-        inside = [np.uint8(255) * (o > 0) for o in odds]
-    result = {}
-    for view, small, o in zip(views, smalls, odds, strict=True):
-        mask = refined(view.photo.pixels, _segmented(small.image, o))
-        result[view.photo.name] = full_size(mask, view.photo.pixels.shape)
-    return result
+        inside = [_segmented(s.image, o) for s, o in zip(smalls, odds, strict=True)]
+    photos = [v.photo for v in views]
+    return {p.name: full_size(refined(p.pixels, m), p.pixels.shape) for p, m in zip(photos, inside, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -334,7 +332,7 @@ def _segmented(image: np.ndarray, odds: np.ndarray) -> np.ndarray:
     """Mask ``(H, W)`` uint8 by GrabCut, which starts from the log odds of the pixels."""
     limit = odds > -np.inf
     labels = np.where(odds > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    for certain, label in ((odds > CERTAIN, cv2.GC_FGD), (odds < -CERTAIN, cv2.GC_BGD)):
+    for certain, label in ((odds > CERTAIN_OBJECT, cv2.GC_FGD), (odds < -CERTAIN_BACKGROUND, cv2.GC_BGD)):
         labels[cv2.erode(certain.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0] = label
     labels[~limit] = cv2.GC_BGD
     return grabcut(image, labels, limit)
