@@ -27,7 +27,7 @@ from reli3d.render.asset import Asset
 
 RESOLUTION = 128  # cells along the longest side
 LIGHT_UNTIL, SHAPE_UNTIL = 0.12, 0.5  # fractions of the budget: first the lighting, then the surface, then all maps
-MIN_HELD_FOR_TRIALS = 2  # held-out views: with fewer, their error shows little about the material
+MIN_VIEWS_FOR_TRIALS = 8  # with fewer, their errors show little about the material
 MIN_ATLAS_TEXELS = 256  # along a side of the new surface's textures: smaller ones have no room for its charts
 MAX_DETAIL_TEXELS = 512  # along a side of the base color's detail map
 UV_TOLERANCE = 1e-3  # beyond [0, 1]; within a texel
@@ -189,7 +189,7 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
     else:
         notes.append("refinement: the surface is not closed, so only maps and lighting are fitted")
     surface, held = data.asset, [v for v in range(len(images)) if v not in used]
-    if len(held) >= MIN_HELD_FOR_TRIALS:
+    if len(images) >= MIN_VIEWS_FOR_TRIALS:
         unknowns, data = best_material_start(unknowns, data, held, weights, budget, seed=seed)
         if data.asset is not surface:
             kind = "metal" if float(data.asset.textures.metallic.mean()) > 0.5 else "nonmetal"
