@@ -19,7 +19,6 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from reli3d.cli.help_format import Defaults
 from reli3d.errors import InputError, printable
 
 ENDING = {"SIGINT": "interrupted", "SIGTERM": "ended by SIGTERM", "SIGHUP": "ended by SIGHUP"}
@@ -32,6 +31,16 @@ class Stopped(BaseException):
     def __init__(self, number: int):
         super().__init__(number)
         self.number = number
+
+
+class Defaults(argparse.HelpFormatter):
+    """Appends the default of an option to its help unless the help mentions it."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        silent = action.default is None or action.default is False or not action.option_strings
+        if silent or action.default == argparse.SUPPRESS or "default" in (action.help or "default"):
+            return action.help
+        return f"{action.help} (default %(default)s)"
 
 
 class Parser(argparse.ArgumentParser):
