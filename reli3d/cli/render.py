@@ -1,6 +1,7 @@
 """``reli3d-render``: still images and turntables of a GLB under an environment map."""
 
 import argparse
+import io
 import json
 import math
 import sys
@@ -165,6 +166,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     from tqdm import tqdm
 
     from reli3d.geometry.camera import Camera, look_at
+    from reli3d.io.files import write_bytes
     from reli3d.io.glb import read_glb
     from reli3d.io.hdr import read_environment, write_exr
     from reli3d.render.environment import Environment
@@ -218,14 +220,14 @@ def render_files(args: argparse.Namespace) -> list[Path]:
             if args.format == "exr":
                 write_exr(written[-1], (image.radiance * 2.0**args.exposure).cpu())
             else:
-                _save(written[-1], _display_image(image, args), format="PNG")
+                write_bytes(written[-1], _encoded([_display_image(image, args)], "png"))
         if args.aovs:
             written += _write_aovs(stem, image)
         bar.update(1)
     bar.close()
     if animation:
         written.append(args.file or args.output / f"{args.glb.stem}.{args.format}")
-        _animate(written[-1], animation, args.format)
+        write_bytes(written[-1], _encoded(animation, args.format))
     return written
 
 
@@ -241,27 +243,20 @@ def _display_image(image, args):
     return Image.fromarray((shown * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
 
 
-def _animate(path: Path, images: list, kind: str) -> None:
-    """Writes a looping animation of ``images`` at RATE frames per second."""
+def _encoded(images: list, kind: str) -> bytes:
+    """A file of one image, or a looping animation of ``images`` at RATE frames per second."""
     if kind == "mp4":
-        from reli3d.io.files import write_bytes
         from reli3d.output.video import mp4_bytes
 
-        return write_bytes(path, mp4_bytes(images, RATE))
-    # disposal 2: clear to transparent before each frame
-    options: Any = {"lossless": False} if kind == "webp" else {"disposal": 2}
-    options |= {"save_all": True, "append_images": images[1:], "duration": round(1000 / RATE), "loop": 0}
-    return _save(path, images[0], format=kind.upper(), **options)
-
-
-def _save(path: Path, image_file, **options) -> None:
-    from io import BytesIO
-
-    from reli3d.io.files import write_bytes
-
-    data = BytesIO()
-    image_file.save(data, **options)
-    write_bytes(path, data.getvalue())
+        return mp4_bytes(images, RATE)
+    options: Any = {}
+    if kind != "png":
+        options = {"save_all": True, "append_images": images[1:], "duration": round(1000 / RATE), "loop": 0}
+        # disposal 2: clear to transparent before each frame
+        options |= {"lossless": False} if kind == "webp" else {"disposal": 2}
+    data = io.BytesIO()
+    images[0].save(data, format=kind.upper(), **options)
+    return data.getvalue()
 
 
 def _write_aovs(stem: Path, image) -> list[Path]:

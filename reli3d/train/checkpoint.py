@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
@@ -96,9 +97,20 @@ def to_resume(path: Path, stage: Stage, groups: list[dict]) -> dict[str, Any]:
     return state
 
 
-def check_shapes(
-    path: Path, state: dict[str, Tensor], model: nn.Module, missing_parameters: set[str] | None = None
-) -> None:
-    """Raise InputError unless ``state`` has the tensors of ``model`` but for those ``missing_parameters``."""
-    shapes = {k: tuple(v.shape) for k, v in model.state_dict().items() if k not in (missing_parameters or ())}
+def check_shapes(path: Path, state: dict[str, Tensor], model: nn.Module, missing: Container[str] = ()) -> None:
+    """Raises InputError unless ``state`` has the tensors of ``model`` except those named in ``missing``."""
+    shapes = {k: tuple(v.shape) for k, v in model.state_dict().items() if k not in missing}
     check_keys(path, {k: tuple(v.shape) for k, v in state.items()}, shapes)
+
+
+def load_average(
+    path: Path, model: nn.Module, state: dict[str, Any] | None = None, missing: Container[str] = ()
+) -> dict[str, Any]:
+    """Loads the averaged weights of a checkpoint into ``model``; returns the checkpoint.
+
+    state: the checkpoint if it is read already.  missing: names of parameters that it may lack.  Raises InputError.
+    """
+    state = state or load(path)
+    check_shapes(path, state["average"], model, missing)
+    model.load_state_dict(state["average"], strict=not missing)
+    return state

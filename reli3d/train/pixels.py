@@ -64,17 +64,6 @@ def missing_parameters(preset: LocalPreset, names: Container[str]) -> set[str]:
     return {f"pyramid.{name}" for name in whole - small}
 
 
-def load_levels(model: LocalReconstructor, state: dict[str, Tensor]) -> LocalReconstructor:
-    """Loads ``state`` into ``model`` and returns it; ``state`` may lack the finer levels of the 2D U-Net.
-
-    Raises ValueError if other parameters are missing or unknown.
-    """
-    missing, unknown = model.load_state_dict(state, strict=False)
-    if lost := [*unknown, *(set(missing) - missing_parameters(model.preset, state))]:
-        raise ValueError(f"state: expected the parameters of the network, got a difference in {lost[0]}")
-    return model
-
-
 def is_pixel_parameter(name: str) -> bool:
     """Whether the per-pixel predictions depend on the parameter ``name``."""
     return name.startswith("pyramid.") and not name.startswith("pyramid.features.")
