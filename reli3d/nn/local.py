@@ -1,9 +1,8 @@
 """The small network: convolutions over each view, over space and over the sphere of directions.
 
-A 2D U-Net predicts base color, normal and depth per pixel of every view (``pyramid``); depths are refined by comparing
-the views (``cost_volume``); a 3D U-Net pools the views over the volume of the object (``volume``); a U-Net on lat-long
-maps completes the environment from the radiance that the surface reflects (``light_map``).  Small MLPs evaluate points
-from all three.  Positions enter only relative to the views and to the object.
+A 2D U-Net predicts base color, normal and depth of every pixel (``pyramid``); depths are refined by comparing the views
+(``cost_volume``); a 3D U-Net pools the views over the volume of the object (``volume``); a U-Net on lat-long maps
+completes the environment (``light_map``).  Small MLPs evaluate points from all.  Positions are relative to the views.
 """
 
 from __future__ import annotations
@@ -71,8 +70,7 @@ class PixelMaps:
         """Decodes the pyramid's output ``raw (V, P, P, 12)`` at the pixels of ``camera``.
 
         span: ``(V, Q, Q, 2)``, depths at which each ray enters and leaves the hull.  mean: :func:`mean_logit` of the
-        object, broadcast over the pixels.  The gain applies to the difference from ``mean``, because exposure makes the
-        absolute brightness of an object ambiguous, but not its hue and contrast.
+        object, from which the gain applies: exposure makes the absolute brightness ambiguous, but not the contrast.
         """
         gain, shift, confidence, rough, metal, normal, depth, chroma = raw.split([1, 3, 1, 1, 1, 3, 1, 1], -1)
         x, y = image_plane(camera)
@@ -186,27 +184,22 @@ class LocalReconstructor(nn.Module):
         4)`` OpenGL.  intrinsics: ``(V, 4)`` in pixels of ``images``.  detail: ``(V, D, D, 4)``, sRGB and signed
         silhouette distance in pixels, from which colors are read.  detail_intrinsics: ``(V, 4)`` in its pixels.
         mirrored: number of views at the end that are the first views, flipped left to right, with mirrored cameras;
-        they are used for shape and material, not for lighting.  inference: without gradient; the field evaluates points
-        by fused kernels, equal to float32 rounding, in blocks that fit the cache.  Gradients reach every parameter,
-        those of the cost volume with two or more input views.  Raises ValueError if more than half of the views are
-        mirrored.
+        they are used for shape and material, not for lighting.  inference: without gradient, by fused kernels, equal to
+        float32 rounding.  Gradients reach every parameter, those of the cost volume with two or more input views.
+        Raises ValueError if more than half of the views are mirrored.
         """
         with torch.set_grad_enabled(torch.is_grad_enabled() and not inference):
             views = images, masks, c2w, intrinsics, detail, detail_intrinsics
-            return self._encoded(views, mirrored, inference)
-
-    def _encoded(self, views: tuple[Tensor, ...], mirrored: int, inference: bool) -> LocalField:
-        images, masks, c2w, intrinsics, detail, detail_intrinsics = views
-        features, pixels, camera = self.read_pixels(*views, mirrored=mirrored)
-        color, mask = pixel_colors(images, masks, camera)
-        tokens = torch.cat([features, pixels.shape_at(features.shape[1])], -1).contiguous()
-        maps = ViewMaps(tokens, detail, Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1]), mirrored)
-        surface = torch.cat([pixels.depth * mask, pixels.spread * mask, mask], -1)
-        volume = self.volume(maps, surface, self.widening)
-        lit = mask[..., 0].clone()
-        lit[maps.input_count :] = 0.0
-        log_light = self._light(pixels, color, lit, camera)
-        return LocalField(maps, self, pixels, color, surface, volume, log_light, inference=inference)
+            features, pixels, camera = self.read_pixels(*views, mirrored=mirrored)
+            color, mask = pixel_colors(images, masks, camera)
+            tokens = torch.cat([features, pixels.shape_at(features.shape[1])], -1).contiguous()
+            maps = ViewMaps(tokens, detail, Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1]), mirrored)
+            surface = torch.cat([pixels.depth * mask, pixels.spread * mask, mask], -1)
+            volume = self.volume(maps, surface, self.widening)
+            lit = mask[..., 0].clone()
+            lit[maps.input_count :] = 0.0
+            log_light = self._light(pixels, color, lit, camera)
+            return LocalField(maps, self, pixels, color, surface, volume, log_light, inference=inference)
 
     @property
     def widening(self) -> Tensor | float:
@@ -346,7 +339,7 @@ class LocalField:
         model, maps = self.model, self.maps.inputs  # mirror images already contribute through the volume
         hull = -bound * model.preset.softness
         views = model.view_features.fused if self.inference else model.view_features
-        of_views, _ = views(maps, points, None if visible is None else visible[:, : maps.input_count], normal)
+        of_views = views(maps, points, None if visible is None else visible[:, : maps.input_count], normal)
         of_space = model.volume.sample(self.volume, points)
         rest = [(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(self.maps.images))]
         ahead = ahead_of_surface(self.surface[: maps.input_count], maps, points, model.widening)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from reli3d._bridge import check
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.nn.blocks import linear_of
 from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
@@ -95,24 +96,25 @@ class Reconstructor(nn.Module):
         Gradients reach every parameter on the way and the inputs.  Raises TypeError unless float32, ValueError on
         shapes that do not belong together and on another device than the parameters'.
         """
-        check_views(images, masks, c2w, intrinsics, self.preset.image_size, self.device)
+        size, lead = self.preset.image_size, tuple(images.shape[:2])
+        check("images", images, shape=("B", "V", size, size, 3), like=self.camera.linear.weight)
+        check("masks", masks, shape=(*lead, size, size), like=images)
+        check("c2w", c2w, shape=(*lead, 4, 4), like=images)
+        check("intrinsics", intrinsics, shape=(*lead, 4), like=images)
+        if 0 in lead:
+            raise ValueError(f"images: expected at least one object and one view, got {lead}")
         camera = self.camera(camera_vector(c2w, intrinsics, images.shape[2]))
-        dtype = self.dtype
-        sizes, light = self.preset.encoder, self.preset.illumination.encoder
-
-        def extra(encoder, mask):
-            return mask.unsqueeze(2).to(dtype) if encoder.mask_channel else None
-
+        extra = lambda sizes, mask: mask.unsqueeze(2).to(self.dtype) if sizes.mask_channel else None  # noqa: E731
         composite = torch.lerp(torch.full_like(images, BACKGROUND), images, masks.unsqueeze(-1))
-        tokens = self.encoder(composite, camera, extra(sizes, masks))
+        tokens = self.encoder(composite, camera, extra(self.preset.encoder, masks))
         planes = self.bank.planes(self.backbone(self.bank.tokens(), tokens))
         shown = masks
         if background_visible is not None:
             shown = torch.where(background_visible[:, None, None, None], torch.ones_like(masks), masks)
-        lit = images * shown.unsqueeze(-1)
-        latent, rotation, strength = self.illumination(lit, extra(light, shown), camera, planes)
+        with_mask = extra(self.preset.illumination.encoder, shown)
+        light = self.illumination(images * shown.unsqueeze(-1), with_mask, camera, planes)
         triplane = self.upsampler(planes).float().movedim(2, -1).contiguous().movedim(-1, 2)  # as sample_triplane reads
-        return Code(triplane, patch_grid(tokens), latent, rotation, strength)
+        return Code(triplane, patch_grid(tokens), *light)
 
     def decode_environment(self, code: Code, height: int | None = None) -> Tensor:
         """Linear radiance ``(B, H, 2H, 3)``, upper edge +Y, horizontal center +X; default height the preset's."""
@@ -128,10 +130,9 @@ class Reconstructor(nn.Module):
     def query(self, code: Code, points: Tensor, heads: Sequence[str] = tuple(HEADS)) -> dict[str, Tensor]:
         """Values of the named heads at points of the model's cube, ``{name: (B, N, outputs)}``, float32.
 
-        points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.  ``density`` is
-        the raw value, see :meth:`sdf`; ``base_color`` is sRGB-encoded; ``roughness`` is perceptual; ``normal`` is
-        unit in the frame of :mod:`reli3d.render.bump`; ``deformation`` and ``flexicubes`` are raw, see
-        :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points and the heads.
+        points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.  Values as
+        :func:`reli3d.nn.heads.activate` describes them, roughness perceptual, normals in the frame of
+        :mod:`reli3d.render.bump`.  Gradients reach the triplane, the points and the heads.
         """
         with torch.autocast(points.device.type, enabled=False):
             values = self.heads(sample_triplane(code.triplane, points / self.preset.radius), heads)
@@ -172,20 +173,3 @@ class Reconstructor(nn.Module):
     def surface_density(self) -> float:
         """Raw density on the surface: :meth:`sdf` is zero there."""
         return math.log(self.preset.density_threshold) - self.preset.density_bias
-
-
-def check_views(
-    images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, size: int, device: torch.device
-) -> None:
-    """Raise TypeError or ValueError, ``name: expected X, got Y``, where the inputs are not what ``encode`` needs."""
-    tails = {"images": (size, size, 3), "masks": (size, size), "c2w": (4, 4), "intrinsics": (4,)}
-    lead = images.shape[:2]
-    for (name, tail), value in zip(tails.items(), (images, masks, c2w, intrinsics), strict=True):
-        if value.dtype != torch.float32:
-            raise TypeError(f"{name}: expected torch.float32, got {value.dtype}")
-        if value.shape[2:] != tail or value.shape[:2] != lead or 0 in value.shape:
-            front = tuple(lead) if name != "images" and len(lead) == 2 else ("B", "V")
-            expected = ", ".join(map(str, (*front, *tail)))
-            raise ValueError(f"{name}: expected shape ({expected}), got {tuple(value.shape)}")
-        if value.device != device:
-            raise ValueError(f"{name}: expected device {device}, got {value.device}")

@@ -1,8 +1,7 @@
 """Pixel-aligned features of points from the input views, which keep the detail of the images in a small network.
 
-A point is projected into every view.  Patch tokens, color, silhouette distance and depth pass through a small MLP per
-view and are pooled over the views, so the features are order-invariant and of one width for any number of views (Yu et
-al. 2021, pixelNeRF, with pooling as in Wang et al. 2021, IBRNet).
+Patch tokens, color, silhouette distance and depth where a point projects pass through a small MLP per view and are
+pooled over the views: order-invariant, for any number of views (Yu et al. 2021, pixelNeRF; Wang et al. 2021, IBRNet).
 """
 
 from __future__ import annotations
@@ -121,7 +120,7 @@ def ahead_of_surface(surface: Tensor, maps: ViewMaps, points: Tensor, widening: 
 
 
 class ViewFeatures(nn.Module):
-    """Pooled features ``(N, width)`` and the mean color ``(N, 3)`` of points over the views."""
+    """Features ``(N, width)`` of points, pooled over the views."""
 
     def __init__(self, token_width: int, channels: int = 16, hidden: int = 48, width: int = 48):
         super().__init__()
@@ -131,7 +130,9 @@ class ViewFeatures(nn.Module):
         )
         self.width = width
 
-    def forward(self, maps: ViewMaps, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None):
+    def forward(
+        self, maps: ViewMaps, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None
+    ) -> Tensor:
         """Features of ``points (N, 3)`` [model frame].
 
         visible: ``(N, V)``, 1 where a surface point is visible, 0 where it is occluded; None for points in free space.
@@ -143,14 +144,16 @@ class ViewFeatures(nn.Module):
         numbers, weight, summary = summarize_views(maps.images, maps.camera, points, visible, normal)
         hidden = linear(gathered, first.weight[:, :channels]) + linear(numbers, first.weight[:, channels:], first.bias)
         pooled = (weight[:, None] @ activation(hidden))[:, 0]
-        return torch.cat([last(pooled), summary], -1), summary[:, :3]  # the last layer is linear: pool first
+        return torch.cat([last(pooled), summary], -1)  # the last layer is linear: pool first
 
     @torch.no_grad()
-    def fused(self, maps: ViewMaps, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None):
+    def fused(
+        self, maps: ViewMaps, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None
+    ) -> Tensor:
         """:meth:`forward` by :func:`~reli3d.nn.view_lookup.pool_views`, equal to float32 rounding; no gradient."""
         first, channels = linear_of(self.per_view, 0), self.tokens.out_features
         # bilinear weights sum to 1, so the layer and its bias commute with the lookup
         tokens = linear(self.tokens(maps.tokens), first.weight[:, :channels], first.bias)
         mix = first.weight[:, channels:].T
         pooled, summary = pool_views(maps.images, tokens, mix, maps.camera, points, visible, normal)
-        return torch.cat([linear_of(self.per_view, 2)(pooled), summary], -1), summary[:, :3]
+        return torch.cat([linear_of(self.per_view, 2)(pooled), summary], -1)

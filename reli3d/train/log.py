@@ -38,7 +38,6 @@ def summary_writer() -> type:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        raise InputError(
-            "--tensorboard", "expected the package tensorboard, got none; pip install tensorboard"
-        ) from None
+        problem = "expected the package tensorboard, got none; pip install tensorboard"
+        raise InputError("--tensorboard", problem) from None
     return SummaryWriter

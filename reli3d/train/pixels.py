@@ -19,14 +19,7 @@ from reli3d.geometry.hull import mask_distance
 from reli3d.nn.local import QUARTER, LocalReconstructor, PixelMaps, mean_logit, pixel_colors
 from reli3d.nn.presets import LocalPreset
 from reli3d.nn.pyramid import ImagePyramid, depth_of_origin, pixel_hull_depths, pixel_positions
-from reli3d.train.batches import (
-    UNCHANGED_PROBABILITY,
-    TrainingViews,
-    finish_known,
-    permuted,
-    valid_means,
-    with_noise,
-)
+from reli3d.train.batches import UNCHANGED_PROBABILITY, TrainingViews, finish_known, permuted, valid_means, with_noise
 
 FULL_SIDE = 256  # pixels of an image at the finest level
 CACHE_BYTES = 1 << 31  # of small images in the memory of a process
@@ -116,21 +109,20 @@ def augmented(views: TrainingViews, rng: np.random.Generator) -> TrainingViews:
     """``views`` in random order, randomly mirrored, with permuted color channels and noise."""
     device = views.images.device
     views = views.of_views(torch.as_tensor(rng.permutation(len(views.masks)), device=device))
-    changed = {}
     if rng.random() > UNCHANGED_PROBABILITY:
         maps = ("images", "masks", "silhouette", "view_material", "view_normal", "view_depth", "view_valid")
-        views = replace(views, **{name: getattr(views, name).flip(2).contiguous() for name in maps})
+        changed = {name: getattr(views, name).flip(2).contiguous() for name in maps}
         flip = torch.tensor([-1.0, 1.0, 1.0], device=device)
+        changed["view_normal"] = changed["view_normal"] * flip
         c2w, intrinsics = views.c2w.clone(), views.intrinsics.clone()
         c2w[:, :3] *= flip[:, None]
         c2w[:, :, 0] *= -1  # the camera stays right-handed, its image is flipped
         intrinsics[:, 2] = views.masks.shape[2] - intrinsics[:, 2]
-        changed = {"c2w": c2w, "intrinsics": intrinsics, "view_normal": views.view_normal * flip}
+        views = replace(views, c2w=c2w, intrinsics=intrinsics, **changed)
     color, material = views.images, views.view_material
     if rng.random() > UNCHANGED_PROBABILITY:
         color, material = permuted(rng, color, material)
-    color = with_noise(color, rng).contiguous()
-    return replace(views, images=color, view_material=material.contiguous(), **changed)
+    return replace(views, images=with_noise(color, rng).contiguous(), view_material=material.contiguous())
 
 
 class ViewCache:

@@ -63,9 +63,8 @@ def capture_views(views: Views, size: int) -> ObjectViews:
     """Square crops around the object, in a frame in which the longest side of its visual hull is 1, as in samples."""
     moved = views.transformed(normalize(views, "hull"))
     cut = moved.resampled(size)
-    valid = torch.stack(
-        [_inside(cut.intrinsics[k], moved.intrinsics[k], moved.masks[k].shape, size) for k in range(len(views))]
-    )
+    cameras = zip(cut.intrinsics, moved.intrinsics, moved.masks, strict=True)
+    valid = torch.stack([_inside(new, old, mask.shape, size) for new, old, mask in cameras])
     background = all(has_background(i, m) for i, m in zip(views.images, views.masks, strict=True))
     return ObjectViews(cut.images, cut.masks, cut.c2w, cut.intrinsics, background=background, valid=valid)
 
@@ -75,5 +74,4 @@ def _inside(new: Tensor, old: Tensor, shape: torch.Size, size: int) -> Tensor:
     at = torch.arange(size, dtype=torch.float32) + 0.5
     x = (at - new[2]) * (old[0] / new[0]) + old[2]
     y = (at - new[3]) * (old[1] / new[1]) + old[3]
-    inside = ((x >= 0) & (x <= shape[1]))[None] & ((y >= 0) & (y <= shape[0]))[:, None]
-    return inside.float()
+    return (((x >= 0) & (x <= shape[1]))[None] & ((y >= 0) & (y <= shape[0]))[:, None]).float()

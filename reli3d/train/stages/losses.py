@@ -38,12 +38,11 @@ def gradients(rendered: Tensor, observed: Tensor) -> Tensor:
     """
     error = (rendered - observed).movedim(-1, 0)[None]
     total = error.new_zeros(())
-    for scale in range(SCALES):
-        if scale:
-            if min(error.shape[2:]) < 4:
-                break
-            error = avg_pool2d(error, 2)
+    for _ in range(SCALES):
         total = total + error.diff(dim=2).abs().mean() + error.diff(dim=3).abs().mean()
+        if min(error.shape[2:]) < 4:
+            break
+        error = avg_pool2d(error, 2)
     return total / SCALES
 
 
@@ -55,14 +54,12 @@ def lpips_distance() -> Perceptual:
     try:
         import lpips
     except ImportError:
-        raise InputError(
-            "--perceptual", "expected the package lpips, got none; pip install lpips, or use --perceptual gradients"
-        ) from None
+        problem = "expected the package lpips, got none; pip install lpips"
+        raise InputError("--perceptual", f"{problem}, or use --perceptual gradients") from None
     weights = torch.hub.get_dir() + "/checkpoints/vgg16-397923af.pth"
     if not os.access(weights, os.R_OK):
-        raise InputError(
-            "--perceptual", f"expected the weights of VGG16 at {weights}, got none; use --perceptual gradients"
-        )
+        problem = f"expected the weights of VGG16 at {weights}, got none"
+        raise InputError("--perceptual", f"{problem}; use --perceptual gradients")
     network = lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
 
     def distance(rendered: Tensor, observed: Tensor) -> Tensor:

@@ -1,7 +1,6 @@
 """The losses of one object in one stage."""
 
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,9 +30,8 @@ def encode(model: Reconstructor, drawn: Draw, *, bfloat16: bool = False) -> Code
     views = drawn.inputs
     shown = torch.tensor([drawn.background_visible], device=views.images.device)
     with torch.autocast(views.images.device.type, torch.bfloat16, enabled=bfloat16):
-        return model.encode(
-            views.images[None], views.masks[None], views.c2w[None], views.intrinsics[None], background_visible=shown
-        )
+        inputs = (t[None] for t in (views.images, views.masks, views.c2w, views.intrinsics))
+        return model.encode(*inputs, background_visible=shown)
 
 
 def shader_of(model: Reconstructor, code: Code, stage: StageConfig, seed: int) -> Shader:
@@ -104,6 +102,6 @@ def total(terms: dict[str, Tensor], stage: StageConfig) -> Tensor:
 
 def checkpointed(model: Reconstructor) -> None:
     """Enables gradient checkpointing of the layers of the encoders and transformers, in place."""
-    layers: list[Any] = [module for module in model.modules() if isinstance(module, CHECKPOINTED)]
-    for layer in layers:
-        layer.forward = partial(checkpoint, layer.forward, use_reentrant=False)
+    for layer in model.modules():
+        if isinstance(layer, CHECKPOINTED):
+            layer.forward = partial(checkpoint, layer.forward, use_reentrant=False)  # type: ignore[method-assign]

@@ -168,21 +168,18 @@ def draw(
     and target.  background: probability that the background is visible.  input_size, target_size: pixels per side.
     patch: side of a random crop of the targets; 0: no crop.
     """
-    rng = np.random.default_rng(seed)
-    sizes = [len(s) for s in sources]
-    index = int(rng.integers(sum(sizes)))
+    rng, k = np.random.default_rng(seed), 0
+    ends = np.cumsum([len(s) for s in sources])
+    index = int(rng.integers(ends[-1]))
     read = int(rng.integers(1, inputs + 1))
-    split = [0]
 
     def choose(total: int) -> list[int]:
-        split[0] = max(1, min(read, total - 1))
-        return rng.permutation(total)[: split[0] + targets].tolist()
+        nonlocal k
+        k = max(1, min(read, total - 1))
+        return rng.permutation(total)[: k + targets].tolist()
 
-    which = 0
-    while index >= sizes[which]:
-        index, which = index - sizes[which], which + 1
-    views = sources[which].load(index, choose)
-    k = split[0]
+    which = int(np.searchsorted(ends, index, side="right"))
+    views = sources[which].load(index - int(ends[which]) + len(sources[which]), choose)
     compared = views.select(range(k, len(views)) if len(views) > k else [0]).resized(target_size)
     if patch:
         x, y = rng.integers(target_size - patch + 1, size=2)
