@@ -37,8 +37,7 @@ def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict
 def submit(work: Callable[[], T], device: torch.device) -> Callable[[], T]:
     """Submits ``work()`` to the bridge's thread pool, without gradient; returns a function that waits for the value.
 
-    Runs ``work`` immediately on CUDA and when only one thread is used.  Exceptions are raised by the returned function,
-    or immediately in these cases.
+    Runs ``work`` immediately on CUDA and when only one thread is used.
     """
     work = torch.no_grad()(work)
     if serial() or device.type == "cuda":

@@ -46,9 +46,9 @@ def unshaded(color: Tensor, brightness: Tensor) -> Tensor:
 
 
 def palette_of(color: Tensor, unlit: Tensor, visible: Tensor) -> Tensor:
-    """Mean and standard deviation ``(12,)`` of the logits of ``color`` and ``unlit``, both ``(N, 3)`` sRGB.
+    """Mean and standard deviation ``(12,)`` of the logits of the observed ``color`` and of :func:`unshaded` colors.
 
-    color: observed.  unlit: divided by the brightness, see :func:`unshaded`.  visible: ``(N,)``, weight of each point.
+    color, unlit: ``(N, 3)``, sRGB.  visible: ``(N,)``, weight of each point.
     """
     weight = ((visible + 1e-6) / (visible + 1e-6).sum())[:, None]
     values = torch.cat([color_logit(color), color_logit(unlit)], -1)
@@ -76,8 +76,7 @@ def brightness_over_normal(color: Tensor, visible: Tensor, normal: Tensor) -> Te
     weight = (visible + 1e-6)[:, None]
     total, mean = weight.sum(), (weight * color).sum(0) / weight.sum()
     basis = harmonics(normal)
-    ridge = torch.full((9,), RIDGE_WEIGHT, device=color.device, dtype=torch.float32)
-    ridge[0] = 0.0
+    ridge = basis.new_tensor([0.0, *[RIDGE_WEIGHT] * 8])
     gram = (basis * weight).T @ basis / total + torch.diag(ridge)
     fit = torch.linalg.solve(gram, (basis * weight).T @ (color / mean.clamp(min=1e-3)) / total)
     fit[0] += (mean < 1e-3).float()

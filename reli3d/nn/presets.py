@@ -1,9 +1,8 @@
 """Sizes and switches of the networks, as plain numbers.
 
-``official`` has the sizes of the published checkpoint (1.574 billion parameters); where the paper and its release
-differ the release is followed, so that its weights load.  ``tiny`` is the same network with 0.6 million parameters:
-its training runs on two cores and shows that the stages work.  ``small`` is the default, a network of convolutions
-whose weights are in the package.
+``official`` has the sizes of the published checkpoint (1.574 billion parameters), also where the paper differs.
+``tiny`` is the same network with 0.6 million parameters, which two cores can train.  ``small`` is the default, a
+network of convolutions whose weights are in the package.
 """
 
 import dataclasses
@@ -44,12 +43,11 @@ class _Checked:
     def _check(self, name: str, kind: type, value) -> None:
         low, high = LIMITS.get(name, (1, MAX_SIZE))
         if kind in (int, float):
-            kinds = (int,) if kind is int else (int, float)
             what = "an integer" if kind is int else "a number"
-            _expect(type(value) in kinds and low <= value <= high, name, f"{what} from {low:g} to {high:g}", value)
+            known = type(value) in (int, kind) and low <= value <= high
+            _expect(known, name, f"{what} from {low:g} to {high:g}", value)
         elif typing.get_origin(kind) is tuple:
-            known = isinstance(value, tuple) and all(type(v) is int for v in value)
-            known = known and 1 <= len(value) <= MAX_LEVELS
+            known = isinstance(value, tuple) and 1 <= len(value) <= MAX_LEVELS and all(type(v) is int for v in value)
             widths = known and all(2 <= v < 16 or 16 <= v <= MAX_SIZE and v % 8 == 0 for v in value)
             expected = f"1 to {MAX_LEVELS} widths, each 2 to 15 or a multiple of 8 up to {MAX_SIZE}"
             _expect(widths, name, expected, value)  # normalized over groups of eight channels
@@ -196,8 +194,8 @@ class LocalPreset(_Checked):
     def __post_init__(self):
         super().__post_init__()
         coarsest = 2 ** len(self.pyramid.widths)
-        holds = self.image_size % coarsest == 0
-        _expect(holds, "image_size", f"a multiple of {coarsest}, as there are levels of pyramid", self.image_size)
+        expected = f"a multiple of {coarsest}, as there are levels of pyramid"
+        _expect(self.image_size % coarsest == 0, "image_size", expected, self.image_size)
 
 
 @dataclass(frozen=True)

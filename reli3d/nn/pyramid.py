@@ -68,10 +68,9 @@ class ImagePyramid(nn.Module):
     """Features of every view at a quarter of its resolution and predictions at half.
 
     Level ``k`` has ``S / 2**(k + 1)`` pixels a side.  Each of the ``sizes.reading`` finest levels also reads the image
-    at its own resolution and adds a residual to the prediction of the coarser levels.  Coarse levels can therefore be
-    trained first, on small images; finer ones are initialized to add zero.  The coarsest level has one mean vector
-    between the views, which have common lighting.  ``in_bfloat16``: compute dtype of the convolutions; parameters and
-    results are float32.
+    at its own resolution and adds a residual to the prediction, initially zero, so that coarse levels can be trained
+    first, on small images.  The coarsest level has one mean vector between the views, which have common lighting.
+    ``in_bfloat16``: compute dtype of the convolutions; parameters and results are float32.
     """
 
     in_bfloat16 = False
@@ -93,17 +92,13 @@ class ImagePyramid(nn.Module):
         self.shared = nn.Linear(widths[-1], widths[-1])
         self.across = nn.ModuleDict({k: nn.Conv2d(coarse, fine, 1) for k, (fine, coarse) in pairs.items()})
         self.up = nn.ModuleDict({k: block(fine, fine) for k, (fine, _) in pairs.items()})
-        predicted = {
-            str(k): nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], PREDICTIONS, 1)) for k in reading
-        }
-        self.says = nn.ModuleDict(predicted)
+        last = {k: nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], PREDICTIONS, 1)) for k in reading}
+        self.says = nn.ModuleDict({str(k): head for k, head in last.items()})
         if finest == 0:
             self.features = nn.Conv2d(widths[1], sizes.features, 1)
-        for head in predicted.values():
-            for value in head[1].parameters():
-                nn.init.zeros_(value)
-        for k in reading[1:]:  # finer levels start by adding zero
-            for value in down[str(k)][1].parameters():
+        # finer levels start by adding zero
+        for layer in (*(head[1] for head in last.values()), *(down[str(k)][1] for k in reading[1:])):
+            for value in layer.parameters():
                 nn.init.zeros_(value)
 
     def forward(

@@ -63,8 +63,7 @@ class FeatureVolume(nn.Module):
         return x[0].float().permute(1, 2, 3, 0).contiguous()
 
     def _convolved(self, x: Tensor) -> Tensor:
-        x = self.first(x)
-        levels = [x]
+        levels = [self.first(x)]
         for down in self.down:
             levels.append(down(levels[-1]))
         x = self.deepest(levels[-1])

@@ -137,18 +137,19 @@ def _size(path: str | os.PathLike) -> int:
         raise WeightsError(path, str(error).split(": ", 1)[1]) from None
 
 
-def shapes(preset: AnyPreset) -> dict[str, tuple[int, ...]]:
-    """Name and shape of every stored tensor of the network; allocates nothing."""
-    return _shapes(_unallocated(preset))
-
-
-def _unallocated(preset: AnyPreset) -> Network:
+def unallocated(preset: AnyPreset) -> Network:
+    """The network on the meta device."""
     with torch.device("meta"):
         return network(preset).float()  # whatever the default dtype is
 
 
-def _shapes(model: Network) -> dict[str, tuple[int, ...]]:
-    return {name: tuple(value.shape) for name, value in model.state_dict().items()}
+def shapes(preset: AnyPreset) -> dict[str, tuple[int, ...]]:
+    """Name and shape of every stored tensor of the network; allocates nothing."""
+    return _shapes(unallocated(preset).state_dict())
+
+
+def _shapes(tensors: Mapping[str, Tensor | Stored]) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(value.shape) for name, value in tensors.items()}
 
 
 def check_keys(where: object, got: Mapping[str, tuple[int, ...]], expected: Mapping[str, tuple[int, ...]]) -> None:
@@ -175,13 +176,12 @@ def locate(weights: str | os.PathLike) -> Path:
 
     Nothing is fetched: :mod:`reli3d.nn.hub` does, on request.  Raises WeightsError where there is no such file.
     """
+    path, fix = Path(weights), "check the path"
     if os.fspath(weights) == "small":
         path, fix = SMALL, "install the package again"
     elif os.fspath(weights) == "official":
         path = official_path()
         fix = "fetch them with reli3d download (about 7 GB, Stability AI Community License), or give a converted file"
-    else:
-        path, fix = Path(weights), "check the path"
     if not path.is_file():
         raise WeightsError(path, f"no such file of weights; {fix}")
     return path
@@ -219,13 +219,12 @@ def load(
 
     preset: expected architecture; default the one in the header.  trunk: dtype of the trunk's parameters, or compute
     dtype of the small network's convolutions; default :func:`default_trunk`, ``auto`` is :func:`fastest_dtype`.  All
-    other parameters are float32.  On a CPU, tensors stored in the requested dtype stay memory-mapped.  Names, shapes,
-    file length and, if given, the hash are checked before anything is allocated.  Raises WeightsError.
+    other parameters are float32.  Everything is checked before anything is allocated.  Raises WeightsError.
     """
     manifest = read_manifest(path)
     preset = preset or manifest.preset()
-    model = _unallocated(preset)
-    check_keys(path, {name: entry.shape for name, entry in manifest.tensors.items()}, _shapes(model))
+    model = unallocated(preset)
+    check_keys(path, _shapes(manifest.tensors), _shapes(model.state_dict()))
     if expected_sha256 is not None:
         found = sha256(path)
         if found != expected_sha256:
@@ -284,12 +283,11 @@ def convert_checkpoint(
 ) -> Manifest:
     """Turn a published training checkpoint into a safetensors file of ours, float32 as it is.
 
-    The checkpoint's tensors stay mapped; names go through :mod:`reli3d.nn.published`; a parameter that is stored under
-    two names must be the same under both.  Only torch's restricted reader touches the pickle: anything that would run
+    The checkpoint's tensors stay mapped.  Only torch's restricted reader touches the pickle: anything that would run
     code is rejected.  Raises WeightsError, and then leaves no file.
     """
     state = published_state(read_checkpoint(source), source)
-    check_keys(source, {name: tuple(value.shape) for name, value in state.items()}, shapes(preset))
+    check_keys(source, _shapes(state), shapes(preset))
     header = {"format": FORMAT, "preset": to_json(preset), "licence": license, "converted_from": sha256(source)}
     write(target, state, header)
     return read_manifest(target)

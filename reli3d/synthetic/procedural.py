@@ -4,6 +4,7 @@ The same seed gives the same object.  ``VALIDATION_SEEDS`` and ``TEST_SEEDS`` ar
 +Y up, centered, longest side 1, inside the sphere of radius 0.87 of the network's frame.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,17 +62,15 @@ def make_object(seed: int) -> ProceduralObject:
     if seed < 0:
         raise ValueError(f"seed: expected at least 0, got {seed}")
     weights = np.array([w for _, w in FAMILIES])
-    attempt = 0
-    while True:  # a cut may leave nothing or a thin sheet: draw again from the next stream of the seed
-        rng = np.random.default_rng((seed, attempt))
-        family = FAMILIES[int(rng.choice(len(FAMILIES), p=weights / weights.sum()))][0]
-        assembly = Assembly(rng)
+    for attempt in itertools.count():  # a cut may leave nothing or a thin sheet: draw again from the next stream
+        assembly = Assembly(np.random.default_rng((seed, attempt)))
+        family = FAMILIES[int(assembly.rng.choice(len(FAMILIES), p=weights / weights.sum()))][0]
         family(assembly)
         if assembly.solid_fraction() > MIN_VOLUME_FRACTION:
-            _deform(assembly)
-            _pose(assembly)
-            return assemble(assembly, family.__name__)
-        attempt += 1
+            break
+    _deform(assembly)
+    _pose(assembly)
+    return assemble(assembly, family.__name__)
 
 
 def assemble(assembly: Assembly, name: str) -> ProceduralObject:
@@ -80,8 +79,7 @@ def assemble(assembly: Assembly, name: str) -> ProceduralObject:
     vertices = unit_size(vertices).astype(np.float32)
     used, part = np.unique(part, return_inverse=True)
     part = part.reshape(-1).astype(np.int32)
-    roles = [assembly.roles[k] for k in used]
-    materials = draw_materials(assembly.rng, roles, part_bounds(vertices, faces, part))
+    materials = draw_materials(assembly.rng, [assembly.roles[k] for k in used], part_bounds(vertices, faces, part))
     return ProceduralObject(vertices, faces, corner_normals(vertices, faces), part, materials, name)
 
 
@@ -144,13 +142,14 @@ def _deform(a: Assembly) -> None:
 
     def move(q: np.ndarray) -> np.ndarray:
         r = (q - center) / size
+        x, y, z = r.T
         if kind == 0:
-            r = r * np.stack([1 + 0.7 * k * r[:, 1], np.ones(len(r)), 1 + 0.7 * k * r[:, 1]], -1)
+            r = np.stack([x * (1 + 0.7 * k * y), y, z * (1 + 0.7 * k * y)], -1)
         elif kind == 1:
-            c, s = np.cos(1.2 * k * r[:, 1]), np.sin(1.2 * k * r[:, 1])
-            r = np.stack([c * r[:, 0] + s * r[:, 2], r[:, 1], c * r[:, 2] - s * r[:, 0]], -1)
+            c, s = np.cos(1.2 * k * y), np.sin(1.2 * k * y)
+            r = np.stack([c * x + s * z, y, c * z - s * x], -1)
         elif kind == 2:
-            r = r + np.stack([0.35 * k * r[:, 1] ** 2, np.zeros(len(r)), np.zeros(len(r))], -1)
+            r = np.stack([x + 0.35 * k * y**2, y, z], -1)
         else:
             r = r + 0.025 * abs(k) * sum(np.sin(r @ w[:, None] + f) for w, f in zip(wave, phase))
         return r * size + center

@@ -162,7 +162,6 @@ def render_sample(
     """
     c2w, views, size = cameras.c2w, len(cameras.c2w), cameras.width
     fine = 1 if views_only else FINE
-    sample: dict[str, Tensor] = {}
     exposure, images, pixels, pixel_radiance = 0.0, [], [], []
     maps: dict[str, list[Tensor]] = {"view_material": [], "view_normal": [], "view_depth": []}
     for k in range(views):
@@ -180,12 +179,11 @@ def render_sample(
         pick = torch.as_tensor(rng.integers(len(seen), size=PIXELS))
         pixels.append(torch.stack([points.position, points.normal, wo], 1)[pick])
         pixel_radiance.append((radiance[pick] * exposure).clamp(max=64.0))
-    sample.update(images=torch.stack(images), c2w=c2w, intrinsics=cameras.intrinsics)
-    sample.update({name: torch.stack(values) for name, values in maps.items()})
+    sample = {"images": torch.stack(images), "c2w": c2w, "intrinsics": cameras.intrinsics}
+    sample |= {name: torch.stack(values) for name, values in maps.items()}
     exposed = (environment.radiance * exposure).permute(2, 0, 1)[None]
-    pooled = functional.interpolate(exposed, (32, 64), mode="area")
-    # stored with -Z at the horizontal center, the format of samples since version 0.1
-    sample["environment"] = quarter_turn(pooled[0].permute(1, 2, 0), 1).clamp(max=6e4).half()
+    pooled = functional.interpolate(exposed, (32, 64), mode="area")[0].permute(1, 2, 0)
+    sample["environment"] = quarter_turn(pooled, 1).clamp(max=6e4).half()  # stored with -Z at the horizontal center
     if not views_only:
         sample.update(pixels=torch.stack(pixels).half(), pixel_radiance=torch.stack(pixel_radiance).half())
         sample.update(_volume(surface, rng), **_surface_points(surface, cameras, rng))
