@@ -71,9 +71,8 @@ class Heads(nn.ModuleDict):
 
         Raises ValueError for an unknown name.
         """
-        for name in names:
-            if name not in self:
-                raise ValueError(f"heads: expected some of {', '.join(self)}, got {name}")
+        if unknown := [name for name in names if name not in self]:
+            raise ValueError(f"heads: expected some of {', '.join(self)}, got {unknown[0]}")
         return {name: activate(name, self[name](features)) for name in names}
 
 
@@ -122,6 +121,5 @@ class WeightMerger(nn.Module):
 
 
 def deformation(raw: Tensor, resolution: int) -> Tensor:
-    """Displacement of grid vertices from raw head outputs: less than half a cell of a unit cube of ``resolution``
-    cells a side."""
+    """Displacement of grid vertices from raw outputs: less than half a cell, of ``resolution`` in a unit cube."""
     return raw.tanh() * (DEFORMATION_LIMIT / (2 * resolution))

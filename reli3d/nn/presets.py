@@ -266,6 +266,9 @@ def _build(kind, values, path: str):
         raise ValueError(f"{path}.{error}") from None
 
 
+OFFICIAL_LIGHT = EncoderSizes(hidden=384, layers=12, heads=6, patch=14, grid=37, mask_channel=True)
+TINY_LIGHT = EncoderSizes(hidden=32, layers=1, heads=2, patch=8, grid=8, mask_channel=True)
+
 OFFICIAL = Preset(
     name="official",
     image_size=512,
@@ -276,13 +279,7 @@ OFFICIAL = Preset(
     upsampler=UpsamplerSizes(convolutions=4, scale=4, channels=40),
     head_width=64,
     illumination=IlluminationSizes(
-        encoder=EncoderSizes(hidden=384, layers=12, heads=6, patch=14, grid=37, mask_channel=True),
-        tokens=78,
-        token_width=256,
-        width=1024,
-        heads=16,
-        layers=4,
-        groups=16,
+        OFFICIAL_LIGHT, tokens=78, token_width=256, width=1024, heads=16, layers=4, groups=16
     ),
     reni=ReniSizes(latents=49, width=128, layers=6, heads=8, height=64),
     resolution=80,
@@ -300,15 +297,7 @@ TINY = Preset(
     backbone=BackboneSizes(heads=2, latents=32, blocks=1, basic_blocks=1, experts=0, experts_from=0, groups=8),
     upsampler=UpsamplerSizes(convolutions=2, scale=4, channels=16),
     head_width=32,
-    illumination=IlluminationSizes(
-        encoder=EncoderSizes(hidden=32, layers=1, heads=2, patch=8, grid=8, mask_channel=True),
-        tokens=16,
-        token_width=16,
-        width=32,
-        heads=2,
-        layers=1,
-        groups=4,
-    ),
+    illumination=IlluminationSizes(TINY_LIGHT, tokens=16, token_width=16, width=32, heads=2, layers=1, groups=4),
     reni=ReniSizes(latents=9, width=32, layers=2, heads=4, height=16),
     resolution=24,
     reads_background=True,

@@ -25,24 +25,12 @@ MIN_VOLUME_FRACTION = 2e-4  # volume over cubed longest side: a sword has 1e-3, 
 FRAME_RADIUS = 0.87  # half diagonal of the unit cube: contains objects of longest side 1
 
 FAMILIES = (
-    (manmade.csg, 0.2),
-    (vessels.vessel, 0.12),
-    (vessels.lamp, 0.05),
-    (manmade.device, 0.12),
-    (vessels.container, 0.08),
-    (manmade.tool, 0.05),
-    (manmade.profile, 0.05),
-    (furniture.table, 0.05),
-    (furniture.chair, 0.06),
-    (furniture.sofa, 0.03),
-    (furniture.shelf, 0.04),
-    (furniture.vehicle, 0.03),
-    (organic.creature, 0.045),
-    (organic.figure, 0.04),
-    (organic.shoe, 0.025),
-    (organic.fruit, 0.025),
+    (manmade.csg, 0.2), (vessels.vessel, 0.12), (vessels.lamp, 0.05), (manmade.device, 0.12),
+    (vessels.container, 0.08), (manmade.tool, 0.05), (manmade.profile, 0.05), (furniture.table, 0.05),
+    (furniture.chair, 0.06), (furniture.sofa, 0.03), (furniture.shelf, 0.04), (furniture.vehicle, 0.03),
+    (organic.creature, 0.045), (organic.figure, 0.04), (organic.shoe, 0.025), (organic.fruit, 0.025),
     (organic.stone, 0.035),
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

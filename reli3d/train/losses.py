@@ -12,24 +12,11 @@ from reli3d.train.batches import Sample, TrainingViews
 from reli3d.train.pixels import Group, predict_pixels
 
 WEIGHTS = {
-    "occupancy": 1.0,
-    "surface": 0.02,
-    "gradient": 0.6,
-    "base_color": 2.0,
-    "pattern": 0.24,
-    "roughness": 2.0,
-    "metallic": 2.0,
-    "normal": 1.0,
-    "pixel_color": 1.5,
-    "pixel_pattern": 0.24,
-    "pixel_roughness": 2.0,
-    "pixel_metallic": 2.0,
-    "pixel_normal": 1.0,
-    "pixel_depth": 0.3,
-    "light": 0.4,
-    "light_scale": 0.1,
-    "irradiance": 0.4,
-}
+    "occupancy": 1.0, "surface": 0.02, "gradient": 0.6,
+    "base_color": 2.0, "pattern": 0.24, "roughness": 2.0, "metallic": 2.0, "normal": 1.0,
+    "pixel_color": 1.5, "pixel_pattern": 0.24, "pixel_roughness": 2.0, "pixel_metallic": 2.0, "pixel_normal": 1.0,
+    "pixel_depth": 0.3, "light": 0.4, "light_scale": 0.1, "irradiance": 0.4,
+}  # fmt: skip
 MAX_PERTURBATION = 0.02, 0.3  # position [model's cube] and normal [radian] of an extracted surface deviate by so much
 GRADIENT_POINTS, GRADIENT_STEP = 384, 0.012  # surface points with a gradient loss; finite-difference step, a grid cell
 PATTERN_FLOOR = 0.002  # mean squared error added to that of a pattern: 27 dB
