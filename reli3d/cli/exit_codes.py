@@ -107,7 +107,12 @@ def command(name: str) -> Callable:
                     except InputError as error:
                         code = _report(name, str(error), 2)
                     except Exception as error:
-                        code = _failed(name, error)
+                        args = _parsed.get()
+                        show_traceback(error, args)
+                        output = getattr(args, "file", None) or getattr(args, "output", None)
+                        log = write_log(output, error) if isinstance(output, Path) else None
+                        where = f"traceback in {printable(str(log))}" if log else "--traceback prints where"
+                        code = _report(name, f"{reason(error)}; {where}", 1)
                     ended.append(code)
                 except KeyboardInterrupt:
                     ended.append(_report(name, ENDING["SIGINT"], 128 + signal.SIGINT))
@@ -129,16 +134,6 @@ def reason(error: BaseException) -> str:
         return " ".join(printable(f"{' -> '.join(files)}: {error.strerror}" if files else error.strerror).split())
     text = " ".join(printable(line) for line in str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
-def _failed(name: str, error: Exception) -> int:
-    """Reports an unexpected exception in one line, writes its traceback, and returns the exit code."""
-    args = _parsed.get()
-    show_traceback(error, args)
-    output = getattr(args, "file", None) or getattr(args, "output", None)
-    log = write_log(output, error) if isinstance(output, Path) else None
-    where = f"; traceback in {printable(str(log))}" if log else "; --traceback prints where"
-    return _report(name, reason(error) + where, 1)
 
 
 def show_traceback(error: BaseException, args: argparse.Namespace | None) -> None:

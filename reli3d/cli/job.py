@@ -43,7 +43,10 @@ class FolderJob:
         self.skip = args.skip_existing
         if budget:
             import reli3d.fit.refine  # noqa: F401 # its kernels are compiled with the others
-        compile_kernels(device)  # takes half a minute the first time, so after the weights are checked
+        modules = cache.imported(device)
+        if not cache.compiled(modules, device):  # half a minute the first time, so after the weights are checked
+            print("compiling kernels (first run only)", file=sys.stderr)
+            load_modules(modules, torch.device(device))
 
     def run(self, folder: Path, name: str, target: Path) -> str:
         """Reconstructs one object and writes its files; with --skip-existing only if they are missing."""
@@ -120,11 +123,3 @@ def catching_interrupt() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def compile_kernels(device: str) -> None:
-    """Compiles the kernel modules in parallel unless they are cached; reports it on stderr."""
-    modules = cache.imported(device)
-    if not cache.compiled(modules, device):
-        print("compiling kernels (first run only)", file=sys.stderr)
-        load_modules(modules, torch.device(device))

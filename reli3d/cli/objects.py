@@ -87,7 +87,11 @@ def make(job: Job, item: Item, failed: Callable[[Exception], None] = lambda erro
         return replace(row, seconds=seconds)
     with contextlib.suppress(OSError):
         log_of(item.target).unlink()  # of an earlier run
-    return replace(row, seconds=seconds, **_recorded(item.target))
+    recorded = {}
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # missing or broken
+        info = json.loads((item.target / "run_info.json").read_bytes())
+        recorded = {"mask_iou": info["mask_iou"], "faces": info["mesh"]["faces"], "notes": tuple(info["notes"])}
+    return replace(row, seconds=seconds, **recorded)
 
 
 def collect(
@@ -118,15 +122,6 @@ def collect(
     if {"refused", "failed"} & results:
         return ended, 2 if results == {"refused"} else 1
     return ended, 0
-
-
-def _recorded(target: Path) -> dict:
-    """The fields of ``run_info.json`` that a summary contains; empty if it is missing or broken."""
-    try:
-        info = json.loads((target / "run_info.json").read_bytes())
-        return {"mask_iou": info["mask_iou"], "faces": info["mesh"]["faces"], "notes": tuple(info["notes"])}
-    except (OSError, ValueError, LookupError, TypeError):
-        return {}
 
 
 def items_of(paths: Sequence[Path], output: Path) -> list[Item]:

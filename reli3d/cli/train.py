@@ -240,10 +240,7 @@ def start_from(start: str, model: "Reconstructor") -> None:
 
 
 def export(args: argparse.Namespace, stage: "Stage") -> "LocalReconstructor | Reconstructor":
-    """The network with the averaged weights of the checkpoint, the small network calibrated.
-
-    Raises InputError if it predicts no surface.
-    """
+    """The network with the averaged weights of the checkpoint, calibrated if it is the small one; or InputError."""
     from reli3d.nn.local import LocalReconstructor
     from reli3d.train import checkpoint
     from reli3d.train.calibrate import calibrate

@@ -35,10 +35,7 @@ BLACK = 0.01  # added to radiance before the logarithm
 def seen_colors(
     scene: RayScene, camera: Camera, points_at: Callable[[Tensor, Tensor], SurfacePoints]
 ) -> tuple[Tensor, Tensor]:
-    """Coverage ``(H, W)`` bool and base color ``(H, W, 3)``, sRGB-encoded.
-
-    points_at: surface points at faces and barycentric coordinates.
-    """
+    """Coverage ``(H, W)`` bool and base color ``(H, W, 3)``, sRGB, of the surface points that ``points_at`` gives."""
     hits, _, _ = primary_hits(scene, camera)
     seen = hits.face >= 0
     color = torch.zeros(*seen.shape, 3, dtype=torch.float32, device="cpu")

@@ -35,9 +35,8 @@ def surface_samples(mesh: Mesh, count: int = SURFACE_SAMPLES, seed: int = 0) -> 
 def geometry(result: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Chamfer distance and F-scores of points ``(N, 3)`` of a result and of the reference.
 
-    cd: mean of the two mean distances (not squared) to the nearest point of the other set.  fs@t: harmonic mean of
-    precision and recall, the fractions of points within t of the other set.  Lengths are in units of half the longest
-    side of the reference.
+    cd: mean of the two mean distances (not squared) to the nearest point of the other set.  fs@t: harmonic mean of the
+    fractions of points within t of the other set.  Lengths are in units of half the reference's longest side.
     """
     half = float(np.ptp(reference, axis=0).max()) / 2.0
     result, reference = result / half, reference / half

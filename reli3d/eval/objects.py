@@ -1,6 +1,4 @@
-"""The tables of the ReLi3D paper for textured GLB files.
-
-Each object is rendered, reconstructed and compared with the original.
+"""The tables of the ReLi3D paper for textured GLB files, which are rendered, reconstructed and compared.
 
 An object is centered and scaled to a longest side of 1.  The input views are lit by one environment.  Held-out views
 compare renderings under the input lighting, relighting by another environment, and the material maps.

@@ -295,10 +295,7 @@ class LocalField:
     inference: bool = False  # points are evaluated without gradient, see LocalReconstructor.encode
 
     def bound(self, points: Tensor) -> Tensor:
-        """Signed distance ``(N,)`` to the visual hull in units of ``softness``, a lower bound of :meth:`sdf`.
-
-        Negative inside.  No gradient.
-        """
+        """Signed distance ``(N,)`` to the visual hull over ``softness``: a lower bound of :meth:`sdf`; no gradient."""
         return -hull_distance(points, self.maps.silhouette, self.maps.camera) / self.model.preset.softness
 
     def grid_bound(self, axis: Tensor, far: float) -> Tensor:

@@ -76,9 +76,7 @@ class ImagePyramid(nn.Module):
     in_bfloat16 = False
 
     def __init__(self, sizes: PyramidSizes, finest: int = 0):
-        """finest: the finest level that is built; images are ``2**finest`` times smaller, and unless it is 0 there are
-        no features.
-        """
+        """finest: finest level that is built, for images ``2**finest`` times smaller; above 0 without features."""
         super().__init__()
         widths, reading = sizes.widths, range(finest, sizes.reading)
         if not reading:
@@ -105,11 +103,10 @@ class ImagePyramid(nn.Module):
         self, images: Tensor, masks: Tensor, place: Tensor, span: Tensor, counts: Sequence[int] | None = None
     ) -> tuple[Tensor | None, Tensor]:
         """Features ``(V, S/4, S/4, F)``, None if ``finest`` > 0, and raw predictions ``(V, S/2, S/2, C)`` of views.
-        Gradients reach every parameter.
 
         images: ``(V, S, S, 3)`` sRGB.  masks: ``(V, S, S)``.  place: ``(V, S, S, 2)`` from :func:`pixel_positions`.
         span: ``(V, S / k, S / k, 2)`` from :func:`pixel_hull_depths`.  S is a multiple of ``2**levels``.  counts:
-        number of views of each object, in order; None if all are of one object.
+        number of views of each object, in order; None if all are of one object.  Gradients reach every parameter.
         """
         counts = [len(masks)] if counts is None else counts
         inverse = torch.cat([masks.new_full((count,), 1.0 / count) for count in counts])

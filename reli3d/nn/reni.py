@@ -2,10 +2,8 @@
 
 Source: Gardner, Egger and Smith 2023, "RENI++", arXiv 2311.09361, in the form and with the parameter names of the file
 published with ReLi3D.  An environment is a set of latent 3-vectors; rotating them about the vertical rotates the map.
-The decoder uses a z-up frame, D = (z, x, y) of the y-up world direction (x, y, z).  It is evaluated in float32.
-
-The published maps have -Z at the horizontal center and +X right of it; :func:`~reli3d.render.latlong.quarter_turn`
-converts.  Maps of this package are those of :mod:`reli3d.render.latlong`.
+The decoder uses a z-up frame, D = (z, x, y) of the y-up world direction (x, y, z), and float32.  The published maps
+have -Z at the horizontal center and +X right of it; those here are of :mod:`reli3d.render.latlong`.
 """
 
 import math

@@ -1,8 +1,7 @@
 """Images to tokens: a vision transformer in the DINOv2 form with camera-modulated norms; triplane tokens to planes.
 
 Sources: DINOv2 (Oquab et al. 2023, arXiv 2304.07193); adaptive layer norm as in DiT (Peebles and Xie 2023, arXiv
-2212.09748); pixel shuffle (Shi et al. 2016, arXiv 1609.05158).  Parameter names are the published checkpoint's.  A
-view's tokens are, in this order: class, patches row by row, camera.
+2212.09748); pixel shuffle (Shi et al. 2016, arXiv 1609.05158).  Parameter names are the published checkpoint's.
 """
 
 import math

@@ -59,10 +59,7 @@ class ViewMaps:
         return visible
 
     def _mirrored(self, scene: RayScene, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
-        """``(N, mirrored)`` float32, 1 where a point is visible in a mirror image and in no input view.
-
-        visible: ``(N, V)`` in the input views.
-        """
+        """``(N, mirrored)`` float32, 1 where a mirror image shows a point and none of the input views does."""
         rest = (~visible.any(1)).nonzero()[:, 0]
         found = position.new_zeros(len(position), self.mirrored)
         found[rest] = visible_from(scene, position[rest], normal[rest], self.camera[self.input_count :]).float()
@@ -71,9 +68,8 @@ class ViewMaps:
     def visibility_within(self, scene: RayScene, position: Tensor, normal: Tensor, corners: Tensor) -> Tensor:
         """:meth:`visibility` of points in faces, tracing rays only to views in which the corners of the face disagree.
 
-        In such faces, points visible in no input view have rays to all mirror images.
-
-        corners: ``(N, V)`` :meth:`visibility` of the corners, interpolated at the points.
+        corners: ``(N, V)`` :meth:`visibility` of the corners, interpolated at the points.  In such faces, points
+        visible in no input view have rays to all mirror images.
         """
         visible = corners.round()
         unsure = (corners - visible).abs() > INTERPOLATION_ERROR
@@ -102,9 +98,8 @@ def ahead_of_surface(surface: Tensor, maps: ViewMaps, points: Tensor, widening: 
     surface: ``(V, P, P, 3)``, pixel depth relative to the world origin's along the camera axis, its standard deviation
     ``s``, both times coverage, and coverage.  Over the views that cover the point: maximum and mean of tanh(distance /
     near), mean of tanh(distance / far), and the fraction of such views; near and far are the roots of
-    ``NEAR_DISTANCE**2 + widening * s**2`` and ``FAR_DISTANCE**2 + widening * s**2``, so that an uncertain depth counts
-    less.  Space in front of a visible surface is empty; far behind it a view has no information.  Gradients reach
-    ``surface`` and ``widening``.
+    ``NEAR_DISTANCE**2 + widening * s**2`` and ``FAR_DISTANCE**2 + widening * s**2``.  Far behind a surface a view has
+    no information.  Gradients reach ``surface`` and ``widening``.
     """
     got, pixel = gather_views(surface, points, maps.camera)
     covered = got[..., 2].clamp(min=0.1)

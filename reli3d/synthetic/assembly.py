@@ -90,8 +90,7 @@ class Assembly:
     def finish(self, max_faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices ``(V, 3)`` float64, faces ``(F, 3)`` and part ``(F,)`` of each face of the union.
 
-        Small disconnected pieces are removed, and the mesh is simplified to at most ``max_faces``.  Raises ValueError
-        if nothing remains.
+        Without small disconnected pieces, simplified to at most ``max_faces``.  Raises ValueError if nothing remains.
         """
         solid = self.joined()
         pieces = solid.decompose()

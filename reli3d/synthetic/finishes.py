@@ -1,7 +1,6 @@
 """Random materials for the parts of a procedural object, by their roles.
 
-Palettes follow everyday objects: mostly grays, browns, whites and dark plastics, few saturated colors.  Colors are
-linear Rec. 709.
+Mostly grays, browns, whites and dark plastics, few saturated colors.  Colors are linear Rec. 709.
 """
 
 from collections.abc import Sequence

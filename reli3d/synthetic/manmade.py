@@ -1,7 +1,6 @@
 """Families of man-made objects: primitives with booleans, devices, tools, extruded outlines.
 
-A family is a function ``family(assembly)`` that draws from ``assembly.rng`` and adds solids, +Y up, of sizes of the
-order of 1.  Proportions are typical: legs a few percent of the height, walls 2 to 6 %, edges rounded by 0 to 10 %.
+A family is a function ``family(assembly)`` that draws from ``assembly.rng`` and adds solids, +Y up, of about size 1.
 """
 
 import itertools

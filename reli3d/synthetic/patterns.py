@@ -52,10 +52,7 @@ def _plane(q: Tensor, normals: Tensor) -> Tensor:
 def blotches(
     points: Tensor, normals: Tensor, frame: np.ndarray, threshold: float, softness: float, *, ridged=False, **noise: Any
 ) -> Tensor:
-    """Thresholded fractal noise: stains, rust, camouflage, speckles; with ``ridged`` marble veins and scratches.
-
-    noise: options of :func:`fbm`.
-    """
+    """Thresholded fractal noise of :func:`fbm`: stains, rust, speckles; with ``ridged`` marble veins and scratches."""
     value, _ = fbm(_in(frame, points), ridged=ridged, **noise)
     return smoothstep(threshold - softness, threshold + softness, 0.5 - value if ridged else value)
 

@@ -73,10 +73,7 @@ def torus(ring: float, tube: float, *, segments: int = 40) -> Manifold:
 
 
 def prism(outline: np.ndarray | Sequence[np.ndarray], height: float, *, bevel: float = 0.0) -> Manifold:
-    """Extrudes a polygon ``(K, 2)`` in x, z, or a list of contours, by ``height``, centered at the origin.
-
-    bevel: inset of the top and bottom rims.
-    """
+    """Extrudes a polygon ``(K, 2)`` in x, z, or contours, by ``height``, centered; ``bevel``: inset of the end rims."""
     contours = [outline] if isinstance(outline, np.ndarray) else list(outline)
     section = CrossSection([np.ascontiguousarray(c, dtype=float) for c in contours])
     body = Manifold.extrude(section, height).translate((0, 0, -height / 2))
@@ -100,8 +97,7 @@ def tube(
 ) -> Manifold:
     """Sweeps a circle along ``path (K, 3)`` with ``radius`` at each point.
 
-    Frames are rotation minimizing (parallel transport, Hanson and Ma 1995); along a closed path the residual rotation
-    is distributed evenly.
+    Frames are rotation minimizing (Hanson and Ma 1995); a closed path distributes the residual rotation evenly.
     """
     path = np.asarray(path, dtype=float)
     count = len(path)

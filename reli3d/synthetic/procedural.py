@@ -86,8 +86,7 @@ def part_bounds(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> np
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = CREASE_DEG) -> np.ndarray:
     """Shading normals ``(F, 3, 3)`` float32 of the corners, smooth across dihedral angles below ``crease_deg``.
 
-    Corners of a vertex that are connected by smooth edges get the mean of their faces' normals, weighted by area, which
-    keeps flat faces next to narrow bevels flat, and by angle, which makes it independent of the triangulation.
+    Corners connected by smooth edges get the mean of their faces' normals, weighted by area and angle.
     """
     p = vertices[faces].astype(np.float64)
     edge = np.roll(p, -1, 1) - p
@@ -163,9 +162,7 @@ def yaw_matrix(angle: float) -> np.ndarray:
 def sample_cameras(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world matrices ``(n, 4, 4)`` (OpenGL) and full fields of view ``(n,)`` in radians, float32.
 
-    Follows the rendering protocol of the paper.  Field of view: normal distribution of mean 29.5 and deviation 3.5
-    degrees, clipped to [22, 37].  Distance: 0.87 / sin(fov / 2) times 0.8 to 1.05.  Azimuths are stratified with jitter
-    and in random order.  One set in six covers only an arc.
+    By the paper's protocol.  Azimuths are stratified with jitter and in random order; one set in six covers an arc.
     """
     if n < 1:
         raise ValueError(f"n: expected at least 1, got {n}")

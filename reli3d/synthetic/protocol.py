@@ -1,11 +1,9 @@
 """Samples by the rendering protocol of the ReLi3D paper (its section B.1).
 
 The protocol: three environments per object, each rotated at random about the vertical axis; a field of view from a
-scaled normal distribution between 22 and 37 degrees; centered objects of unit scale; cameras that fill the frame with
-padding and a small shift; 100 images of objects with PBR ground truth, 30 of others.
-
-Not given in the paper: here the views of an object are divided among its environments, the normal distribution is cut
-at three standard deviations, and cameras are uniform over a zone of the sphere.
+scaled normal distribution between 22 and 37 degrees; centered objects of unit scale that fill the frame with padding
+and a small shift; 100 images of objects with PBR ground truth, 30 of others.  Not given in the paper: here the views
+are divided among the environments, the distribution is cut at three deviations, cameras are uniform over a zone.
 """
 
 import math
@@ -44,10 +42,9 @@ def fields_of_view(u: np.ndarray) -> np.ndarray:
 
 
 def framed_cameras(vertices: Tensor, rng: np.random.Generator, count: int, size: int) -> Camera:
-    """``count`` random cameras of ``size`` by ``size`` pixels that frame an object of unit scale at the origin.
+    """``count`` random cameras of ``size`` by ``size`` pixels that frame centered ``vertices (V, 3)`` of unit scale.
 
-    vertices: ``(V, 3)`` of the object.  Each camera looks at the origin from the distance at which the object leaves
-    the padding free, and is then shifted.  The principal point is the image center.
+    Each looks at the origin from the distance at which the object leaves the padding free, and is then shifted.
     """
     fov = np.radians(fields_of_view(rng.random(count)))
     azimuth = rng.uniform(0.0, 2.0 * math.pi, count)

@@ -170,7 +170,8 @@ def render_sample(
         if k == 0:
             bright = max(float(radiance.mean(-1).quantile(0.9)), 1e-3)
             exposure = EXPOSURE_TARGET / bright * float(np.exp(rng.normal(0, 0.25)))
-        alpha = _coverage(surface.scene, cameras[k], fine + 1)
+        hit = surface.scene.occluded(*camera_rays(cameras[k].scaled(fine + 1))).float()
+        alpha = functional.avg_pool2d(hit[None, None], fine + 1)[0, 0]  # antialiased
         image = pooled_pixels((image * exposure).clamp(0, 4), size, fine).clamp(0, 1)  # sensor saturation
         encoded = torch.cat([linear_to_srgb(image), alpha[..., None]], -1)
         images.append((encoded * 255 + 0.5).to(torch.uint8))
@@ -213,13 +214,6 @@ def pooled_pixels(rays: Tensor, size: int, fine: int = FINE) -> Tensor:
     """Means ``(S, S, C)`` over the ``fine**2`` rays of each pixel, of values ``(rays, C)``."""
     image = rays.reshape(1, size * fine, size * fine, -1).permute(0, 3, 1, 2)
     return functional.avg_pool2d(image, fine)[0].permute(1, 2, 0)
-
-
-def _coverage(scene: RayScene, camera: Camera, grid: int) -> Tensor:
-    """Antialiased alpha ``(S, S)``: fraction of ``grid**2`` subpixel rays that hit."""
-    origins, directions = camera_rays(camera.scaled(grid))
-    hit = scene.occluded(origins, directions).float()
-    return functional.avg_pool2d(hit[None, None], grid)[0, 0]
 
 
 def random_faces(surface: Surface, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:

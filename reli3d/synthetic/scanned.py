@@ -32,10 +32,7 @@ def outside_distance(surface: Surface, points: Tensor) -> Tensor:
 
 
 class ScannedSurface:
-    """A GLB, centered, longest side 1, randomly stretched and tinted: a ``Surface`` of :mod:`.samples`.
-
-    rng: None keeps proportions and colors.
-    """
+    """A GLB, centered, longest side 1, by ``rng`` randomly stretched and tinted: a ``Surface`` of :mod:`.samples`."""
 
     def __init__(self, path: Path, rng: np.random.Generator | None):
         self.assets = _read(path)

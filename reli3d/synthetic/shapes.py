@@ -68,10 +68,7 @@ def capped(v: np.ndarray, f: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, 
 
 
 def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject:
-    """Combines the meshes of ``paths`` into one object: the others are placed next to, on or in the first.
-
-    Raises InputError above MAX_FACES faces.
-    """
+    """One object of the meshes of ``paths``, the others next to, on or in the first.  InputError above MAX_FACES."""
     vertices: list[np.ndarray] = []
     faces, owners, start, parts = [], [], 0, 0
     for k, path in enumerate(paths):

@@ -212,10 +212,7 @@ def load_sample(
 def draw_samples(
     files: Sequence[Path], seeds: Iterable[tuple[int, ...]], *, points: int, max_views: int, **options: Any
 ) -> list[Sample]:
-    """For each of ``seeds`` a random object of ``files`` with 1 to ``max_views`` random views.
-
-    options: of :func:`load_sample`.
-    """
+    """For each of ``seeds`` a random object of ``files`` with 1 to ``max_views`` views.  options: of load_sample."""
     drawn = []
     for seed in seeds:
         rng = np.random.default_rng(seed)

@@ -49,11 +49,7 @@ def save(
 
 
 def load(path: Path) -> dict[str, Any]:
-    """The dictionary that :func:`save` wrote, on the CPU.
-
-    In files of version 0.2 ``stage`` and ``measures`` are empty.  Raises InputError for a missing or broken file, or
-    one of another kind.
-    """
+    """The dictionary that :func:`save` wrote, on the CPU; ``stage`` is empty in files of 0.2.  Raises InputError."""
     file_size(path)
     try:
         state = torch.load(path, weights_only=True, map_location="cpu")

@@ -1,8 +1,7 @@
 """Training of the environment prior: a RENI++ decoder, jointly with one latent code per map (an auto-decoder).
 
-The decoder is equivariant to rotation about the vertical axis, so maps need no augmentation by yaw.  Blends of two
-maps with a relative rotation and a tint augment a small collection.  Maps are scaled to a geometric mean of 1; the
-exposure is a separate output of the network.  Source: Gardner et al. 2023, RENI++, arXiv 2311.09361, section 4.
+The decoder is equivariant to rotation about the vertical axis.  Blends of two maps augment a small collection.  Maps
+are scaled to a geometric mean of 1.  Source: Gardner et al. 2023, RENI++, arXiv 2311.09361, section 4.
 """
 
 from collections.abc import Sequence

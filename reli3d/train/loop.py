@@ -1,8 +1,6 @@
 """The training loop of all stages: schedule, optimizer, averaged weights, checkpoints and log.
 
-A :class:`~reli3d.train.stage.Stage` supplies the model, multipliers of the learning rate, batches, losses and
-validation images.  A run resumes from its last checkpoint; on a CPU the result is bitwise identical to that of an
-uninterrupted run.
+A run resumes from its last checkpoint; on a CPU bitwise identically to an uninterrupted run.
 """
 
 import math

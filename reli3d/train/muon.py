@@ -29,8 +29,7 @@ def orthogonalized(matrix: Tensor) -> Tensor:
 class Muon(torch.optim.AdamW):
     """AdamW in which matrices of at least MIN_RANK, and convolutions as matrices ``(outputs, rest)``, follow Muon.
 
-    The step of a matrix is the orthogonalized Nesterov momentum, scaled to the root mean square ``UPDATE_RMS``, so that
-    both share learning rate and weight decay.  Groups whose ``times`` exceeds MAX_TIMES are left to AdamW.
+    Steps are scaled to the root mean square ``UPDATE_RMS``.  Groups whose ``times`` exceeds MAX_TIMES follow AdamW.
     """
 
     @torch.no_grad()

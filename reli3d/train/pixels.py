@@ -1,7 +1,6 @@
 """Training of the 2D U-Net alone, with many views per step, at full, half or a quarter of the resolution.
 
-The coarse levels are trained first on small images, which cost less.  Finer levels are added later and start by adding
-a residual of zero (after Karras et al. 2018, Progressive Growing of GANs, arXiv 1710.10196).
+Finer levels are added later, with a residual of zero (after Karras et al. 2018, Progressive Growing, 1710.10196).
 """
 
 from collections.abc import Container, Iterable, Sequence

@@ -84,9 +84,8 @@ def relight_views(
     """Views ``(V, S, S, 4)`` under ``light (H, 2H, 3)``, and that map as ``(32, 64, 3)`` at the views' exposure.
 
     images: ``(V, S, S, 4)``, of which only alpha is used.  material, normal: of the pixels ``valid (V, S, S)``, as in
-    :mod:`reli3d.synthetic.samples`.  camera: the batch of V.  flash: mean radiance of the object under a light at each
-    camera, highlights included, relative to that under ``light``.  Without shadows: the G-buffers have no geometry
-    behind other surfaces.
+    :mod:`reli3d.synthetic.samples`.  flash: mean radiance of the object under a light at each camera, relative to that
+    under ``light``.  Without shadows: the G-buffers have no geometry behind other surfaces.
     """
     views, size = images.shape[:2]
     light = light.to(images.device)

@@ -46,10 +46,9 @@ class Workers:
         return flat[-len(values) :].to(values.device, copy=True)
 
     def leave(self) -> None:
-        """Destroys the group; with several processes also exits this one, with code 0.
+        """Destroys the group; with several processes also exits this one, with code 0, without interpreter shutdown.
 
-        Threads of Gloo release tensors some time after an operation, which needs the interpreter and aborts the process
-        if that is shutting down.  Therefore the process exits without interpreter shutdown; flush output before.
+        Gloo's threads release tensors after an operation, which aborts a process that is shutting down.
         """
         if self.count == 1:
             return

@@ -5,7 +5,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from reli3d.errors import InputError, shown
 from reli3d.io.files import read_bytes
@@ -64,14 +63,11 @@ def capture_views(views: Views, size: int) -> ObjectViews:
     moved = views.transformed(normalize(views, "hull"))
     cut = moved.resampled(size)
     cameras = zip(cut.intrinsics, moved.intrinsics, moved.masks, strict=True)
-    valid = torch.stack([_inside(new, old, mask.shape, size) for new, old, mask in cameras])
+    at, valid = torch.arange(size, dtype=torch.float32) + 0.5, []
+    for new, old, mask in cameras:  # pixels of the crop that are inside the input image
+        x, y = ((at - new[k]) * (old[k - 2] / new[k - 2]) + old[k] for k in (2, 3))
+        valid.append(((y >= 0) & (y <= mask.shape[0]))[:, None] & ((x >= 0) & (x <= mask.shape[1])))
     background = all(has_background(i, m) for i, m in zip(views.images, views.masks, strict=True))
-    return ObjectViews(cut.images, cut.masks, cut.c2w, cut.intrinsics, background=background, valid=valid)
-
-
-def _inside(new: Tensor, old: Tensor, shape: torch.Size, size: int) -> Tensor:
-    """``(S, S)`` 1 where the crop's pixel is inside the input image of ``shape`` (rows, columns)."""
-    at = torch.arange(size, dtype=torch.float32) + 0.5
-    x = (at - new[2]) * (old[0] / new[0]) + old[2]
-    y = (at - new[3]) * (old[1] / new[1]) + old[3]
-    return (((x >= 0) & (x <= shape[1]))[None] & ((y >= 0) & (y <= shape[0]))[:, None]).float()
+    return ObjectViews(
+        cut.images, cut.masks, cut.c2w, cut.intrinsics, background=background, valid=torch.stack(valid).float()
+    )

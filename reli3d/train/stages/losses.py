@@ -104,11 +104,10 @@ def map_terms(rendering: Rendering, target: ObjectViews, view: int) -> dict[str,
 
 
 def light_terms(latent: Tensor, rotation: Tensor, strength: Tensor, radiance: Tensor, target: ObjectViews) -> dict:
-    """``latent``: mean squared error of the rotated latents and the strength; without ground truth ``neutral``, the
-    mean relative saturation of the lighting.
+    """``latent``: mean squared error of the rotated latents and the strength; else ``neutral``, mean saturation.
 
     latent: ``(L, 3)``.  rotation: ``(3, 3)``.  strength: ``()``.  radiance: ``(K, 3)`` in directions uniform over the
-    sphere.  The prior is equivariant to rotation, so latents with a rotation equal the rotated latents.
+    sphere.
     """
     if target.latent is None or target.strength is None:
         mean = radiance.mean(-1, keepdim=True)

@@ -137,6 +137,5 @@ def averaged(model: Reconstructor, average: dict[str, Tensor]) -> Reconstructor:
 
 def _tile(values: np.ndarray) -> np.ndarray:
     """``values`` resized to TILE_PIXELS by TILE_PIXELS pixels, nearest neighbor, uint8."""
-    at = (np.arange(TILE_PIXELS) * values.shape[0]) // TILE_PIXELS
-    across = (np.arange(TILE_PIXELS) * values.shape[1]) // TILE_PIXELS
-    return (values[at][:, across] * 255 + 0.5).astype(np.uint8)
+    rows, columns = (np.arange(TILE_PIXELS) * size // TILE_PIXELS for size in values.shape[:2])
+    return (values[rows][:, columns] * 255 + 0.5).astype(np.uint8)
