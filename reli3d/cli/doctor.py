@@ -19,10 +19,7 @@ PROBLEM = "PROBLEM: "  # prefix of a value that makes the package unusable
 
 
 def examine() -> tuple[list[tuple[str, str]], bool]:
-    """Rows ``(name, value)``, and whether the package is usable, that is, no value begins with PROBLEM.
-
-    Compiles one kernel unless it is cached, which takes some seconds.
-    """
+    """Rows ``(name, value)``, and whether the package is usable: no value begins with PROBLEM.  Compiles a kernel."""
     rows = []
     for part in (_versions, _devices, _cache, _kernels, _files):
         try:

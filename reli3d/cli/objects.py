@@ -1,8 +1,4 @@
-"""Runs a job over many objects: in this process, in worker processes or on a Ray cluster.
-
-An object whose worker crashed is retried once, in worker processes while nothing else runs.  Workers are
-single-threaded; results are bitwise identical for any number of workers.
-"""
+"""Runs a job over many objects: here, in single-threaded workers, with bitwise identical results, or on Ray."""
 
 import contextlib
 import csv
@@ -125,10 +121,7 @@ def collect(
 
 
 def items_of(paths: Sequence[Path], output: Path) -> list[Item]:
-    """The folders among ``paths`` and those named in list files among them, with targets in ``output``.
-
-    A target has the name of its folder, with a number appended to duplicates.  Raises InputError.
-    """
+    """The folders among ``paths`` and in their list files, with unique targets in ``output``.  Raises InputError."""
     folders: list[Path] = []
     for path in paths:
         is_list = path.is_file() and path.suffix.lower() not in (*VIDEOS, *PHOTOGRAPHS)

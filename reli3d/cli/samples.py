@@ -45,10 +45,7 @@ class SampleJob:
         self.lights = [m for m, h in zip(maps, held_out(names), strict=True) if h == spec.held_out]
 
     def run(self, folder: object, name: str, target: Path) -> str:
-        """Writes the sample ``name``: the seed, with the paper's protocol followed by the index of the environment.
-
-        Raises InputError for a mesh that cannot be used.
-        """
+        """Writes the sample ``name``: the seed, in the paper's protocol with the index of the environment."""
         if target.exists():  # written by a worker that crashed later
             return "skipped"
         seed, _, place = name.partition("_")

@@ -1,8 +1,4 @@
-"""Metrics on held-out procedural objects under held-out environments.
-
-For every sample: silhouette IoU and base color PSNR in held-out views, with the PSNR of the best constant color as a
-baseline; and the error of the environment, with that of the mean training environment as a baseline.
-"""
+"""Metrics on held-out procedural objects: silhouettes, base color in held-out views and lighting, with baselines."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -149,10 +145,7 @@ def table(
     *,
     symmetry: str = "auto",
 ) -> dict[int, dict]:
-    """:func:`summary` of the samples in ``folder`` for each number of input views.
-
-    progress: called with one line per object.  Raises InputError if the folder has no samples.
-    """
+    """:func:`summary` of the samples in ``folder`` for each number of views.  progress: called for each object."""
     files = sorted(folder.glob("*.safetensors"))
     if not files:
         raise InputError(folder, "expected *.safetensors files, got none; make samples with reli3d-data render")

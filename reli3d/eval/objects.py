@@ -110,11 +110,7 @@ def input_views(target: ReferenceObject, count: int, hero: int, exposure: float)
 def evaluate(
     model: Network, target: ReferenceObject, count: int, *, seed: int = 0
 ) -> tuple[dict[str, float], list[Tensor]]:
-    """Metrics of one object reconstructed from ``count`` views, and a row of images for :func:`sheet`.
-
-    The reference view is random.  ``empty``: 1 if the network predicts no surface; the images are then black and the
-    geometry metrics absent.
-    """
+    """Metrics of one object from ``count`` views, ``empty`` 1 without a surface, and a row for :func:`sheet`."""
     exposures = exposure_of(target, target.light), exposure_of(target, target.other)
     front = int(np.random.default_rng((seed, count)).integers(count))
     views = input_views(target, count, front, exposures[0])

@@ -1,7 +1,4 @@
-"""Decoder heads of the triplane: independent MLPs on point features, and the merging of FlexiCubes weights.
-
-Sizes are the published ones; :mod:`reli3d.nn.published` maps the published names to these.
-"""
+"""Decoder heads of the triplane: independent MLPs on point features, and the merging of FlexiCubes weights."""
 
 from collections.abc import Sequence
 

@@ -29,11 +29,7 @@ class Shading:
     WIDTH: ClassVar[int] = 24  # of :meth:`features`
 
     def features(self, normal: Tensor, color: Tensor) -> Tensor:
-        """Features ``(N, 24)``: normal, log(irradiance / pi), log of the observed brightness, logit of the color
-        over that brightness, palette.
-
-        normal: ``(N, 3)`` unit, world.  color: ``(N, 3)`` sRGB, observed.  No gradient.
-        """
+        """Features ``(N, 24)`` at unit ``normal (N, 3)``, observed as ``color (N, 3)``, sRGB; no gradient."""
         predicted = torch.log(self.irradiance.lookup(normal.contiguous()) / torch.pi + LOG_OFFSET)
         brightness = brightness_at(normal, self.observed)
         unlit = color_logit(unshaded(color, brightness))

@@ -158,9 +158,7 @@ class LocalReconstructor(nn.Module):
         return torch.bfloat16 if self.pyramid.in_bfloat16 else torch.float32
 
     def to_compute(self, dtype: torch.dtype) -> LocalReconstructor:
-        """Sets the compute dtype of the U-Nets' convolutions, float32 or bfloat16; parameters, results and the cost
-        volume stay float32.  Raises ValueError for another dtype.
-        """
+        """Sets the compute dtype of the U-Nets' convolutions, float32 or bfloat16, else ValueError."""
         if dtype not in (torch.float32, torch.bfloat16):
             raise ValueError(f"dtype: expected float32 or bfloat16, got {dtype}")
         self.pyramid.in_bfloat16 = self.volume.in_bfloat16 = dtype == torch.bfloat16
@@ -207,11 +205,7 @@ class LocalReconstructor(nn.Module):
         return 0.0 if self.cost_volume is None else self.cost_volume.widening
 
     def read_pixels(self, *views: Tensor, mirrored: int = 0) -> tuple[Tensor, PixelMaps, Camera]:
-        """The per-view maps of :meth:`encode`: features at a quarter of the resolution, predictions at half, and the
-        cameras of the predictions.  The maps of mirror images are those of the input views, flipped.
-
-        views: the six tensors of :meth:`encode`.
-        """
+        """Features and predictions of the ``views`` of :meth:`encode`, and the cameras of the predictions."""
         images, masks, c2w, intrinsics, detail, detail_intrinsics = views
         if not 0 <= 2 * mirrored <= len(images):
             raise ValueError(f"mirrored: expected at most half of the {len(images)} views, got {mirrored}")
@@ -256,10 +250,7 @@ class LocalReconstructor(nn.Module):
 def _refined_depth(
     volume: CostVolume, pixels: PixelMaps, features: Tensor, images: Tensor, masks: Tensor, span: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    """Depth of ``pixels`` plus the correction by ``volume``, and its standard deviation, ``(V, P, P, 1)``.
-
-    Correction and deviation are upsampled bilinearly from half the resolution.
-    """
+    """Depth of ``pixels`` plus the correction by ``volume``, and its deviation, ``(V, P, P, 1)``, upsampled."""
     count = len(features)
     quarter = camera.resized(features.shape[2], features.shape[1])
     color, coverage = pixel_colors(images[:count], masks[:count], quarter)
@@ -299,10 +290,7 @@ class LocalField:
         return -hull_distance(points, self.maps.silhouette, self.maps.camera) / self.model.preset.softness
 
     def grid_bound(self, axis: Tensor, far: float) -> Tensor:
-        """:meth:`bound` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; axis: ``(n,)`` ascending.
-
-        Where it exceeds ``far``, the result is any value above ``far``.
-        """
+        """:meth:`bound` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; only above ``far`` if it is."""
         softness = self.model.preset.softness
         return -hull_grid(axis, self.maps.silhouette, self.maps.camera, far=far * softness) / softness
 
@@ -381,10 +369,7 @@ class LocalField:
             return replace(self, shading=Shading(irradiance, observed, palette_of(color, unlit, visible_in_any)))
 
     def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> SurfacePoints:
-        """Surface points with material.
-
-        position, geometric normal: ``(N, 3)``, unit.  visible: ``(N, V)``, 1 where the view sees the point.
-        """
+        """Surface points with material.  normal: geometric, unit.  visible: ``(N, V)``, 1 where a view sees it."""
 
         def evaluate(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
             fused = self.fused(position, normal, visible)
@@ -393,11 +378,7 @@ class LocalField:
         return SurfacePoints(position, normal, **self._rows(evaluate, position, normal, visible))
 
     def heads(self, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
-        """Raw head outputs ``(N, HEAD_OUTPUTS)`` at surface points, for :meth:`material_from_heads`.
-
-        Arguments as in :meth:`material`.  The outputs vary at the scale of volume cells, not of texels, so they may be
-        evaluated at vertices and interpolated.
-        """
+        """Raw outputs ``(N, HEAD_OUTPUTS)`` for :meth:`material_from_heads`: smooth, so that vertices suffice."""
         evaluate = lambda p, n, v: {"heads": self._heads(self.fused(p, n, v), p, n, v)}  # noqa: E731
         return self._rows(evaluate, position, normal, visible)["heads"]
 

@@ -121,10 +121,7 @@ class Reconstructor(nn.Module):
         return self.environment(code.latent, code.rotation, code.strength, height)
 
     def radiance(self, code: Code, directions: Tensor) -> Tensor:
-        """Linear radiance ``(B, N, 3)`` from world directions ``(B or 1, N, 3)``, unit, y up.
-
-        Gradients reach the latents, the rotation, the strength, the decoder and the directions.
-        """
+        """Linear radiance ``(B, N, 3)`` from world directions ``(B or 1, N, 3)``, unit, y up; differentiable."""
         return self.environment.radiance(code.latent, code.rotation, code.strength, reni_frame(directions))
 
     def query(self, code: Code, points: Tensor, heads: Sequence[str] = tuple(HEADS)) -> dict[str, Tensor]:

@@ -1,8 +1,4 @@
-"""2D U-Net on every view, which predicts base color, roughness, metallic, normal and depth per pixel.
-
-Convolutions are local and translation-equivariant and so need far fewer training objects than a transformer.  Source:
-Ronneberger et al. 2015, U-Net, arXiv 1505.04597.
-"""
+"""2D U-Net on every view, which predicts material, normal and depth per pixel (Ronneberger et al. 2015, 1505.04597)."""
 
 from collections.abc import Sequence
 
@@ -36,11 +32,7 @@ def depth_of_origin(c2w: Tensor) -> Tensor:
 
 
 def pixel_positions(camera: Camera) -> Tensor:
-    """Coordinates ``(V, S, S, 2)`` [world units, right and up] where pixel rays hit the plane through the world origin
-    parallel to the image plane.  They encode the scale and the position of a crop.
-
-    camera: ``V`` views of ``S`` by ``S`` pixels.
-    """
+    """Right and up ``(V, S, S, 2)`` where pixel rays hit the plane through the origin parallel to the image."""
     c2w = camera.c2w
     depth = depth_of_origin(c2w)[:, None, None]
     x, y = image_plane(camera)

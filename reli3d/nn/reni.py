@@ -109,10 +109,7 @@ class ReniField(nn.Module):
         return torch.cat([horizontal @ latent[..., :2].transpose(1, 2), rest], dim=-1)
 
     def forward(self, latent: Tensor, directions: Tensor) -> Tensor:
-        """Logarithm of the radiance, ``(B, N, 3)``.
-
-        latent: ``(B, L, 3)``.  directions: ``(B or 1, N, 3)`` unit; both in the decoder's frame.  Gradients reach both.
-        """
+        """Log radiance ``(B, N, 3)`` of ``(B, L, 3)`` in ``(B or 1, N, 3)`` of the decoder's frame; differentiable."""
         return self.network(self.directional(latent, directions), self.conditioning(latent).unsqueeze(1))
 
 
@@ -131,11 +128,7 @@ class EnvironmentDecoder(nn.Module):
         self.register_buffer("sample_directions", directions)
 
     def forward(self, latent: Tensor, rotation: Tensor, strength: Tensor, height: int | None = None) -> Tensor:
-        """Linear radiance ``(B, H, 2H, 3)``, upper edge +Y, horizontal center +X.
-
-        latent: ``(B, L, 3)``.  rotation: ``(B, 3, 3)`` applied to every latent.  strength: ``(B,)``, natural logarithm
-        of a factor.
-        """
+        """Linear radiance ``(B, H, 2H, 3)``, upper edge +Y, horizontal center +X; arguments as in ``Code``."""
         height = height or self.height
         directions = reni_frame(lat_long_directions(height, device=latent.device)).reshape(1, -1, 3)
         radiance = self.radiance(latent, rotation, strength, directions)
@@ -150,10 +143,7 @@ class EnvironmentDecoder(nn.Module):
 
 
 def rotation_from_6d(d: Tensor) -> Tensor:
-    """Rotation matrices ``(..., 3, 3)`` from ``(..., 6)``: two columns, orthonormalized, and their cross product.
-
-    Source: Zhou et al. 2019, arXiv 1812.07035.  Zero input gives a zero matrix.
-    """
+    """Rotations ``(..., 3, 3)`` from two columns ``(..., 6)``, orthonormalized (Zhou et al. 2019, arXiv 1812.07035)."""
     eps = 1.0e-7 if d.dtype != torch.float64 else 1.0e-8  # the published floors
     a, b = d[..., :3], d[..., 3:]
     x = functional.normalize(a, dim=-1, eps=eps)

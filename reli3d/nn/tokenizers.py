@@ -22,10 +22,7 @@ RESAMPLE_OFFSET = 0.1
 
 
 def camera_vector(c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """The 25 numbers of a view: camera-to-world row by row, then the 3x3 intrinsics divided by the image size.
-
-    c2w: ``(..., 4, 4)``.  intrinsics: ``(..., 4)`` fx, fy, cx, cy in pixels of an image of ``size`` by ``size``.
-    """
+    """The 25 numbers of a view: camera-to-world row by row, then the 3x3 intrinsics over the image ``size``."""
     fx, fy, cx, cy = (intrinsics / size).unbind(-1)
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     normalized = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], dim=-1)
@@ -149,11 +146,7 @@ class ImageTokenizer(nn.Module):
         )
 
     def forward(self, images: Tensor, camera: Tensor, extra: Tensor | None = None) -> Tensor:
-        """Tokens ``(B, V, 1 + patches + 1, hidden)``.
-
-        images: ``(B, V, S, S, 3)`` sRGB in [0, 1].  camera: ``(B, V, camera_width)``.
-        extra: ``(B, V, K, S, S)`` channels appended after RGB as they are.
-        """
+        """Tokens ``(B, V, 1 + patches + 1, hidden)`` of sRGB ``(B, V, S, S, 3)``; extra: channels after RGB."""
         dtype = self.model.embeddings.cls_token.dtype
         mean, std = images.new_tensor(IMAGE_MEAN), images.new_tensor(IMAGE_STD)
         pixels = ((images - mean) / std).movedim(-1, 2)

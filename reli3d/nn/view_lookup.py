@@ -1,8 +1,4 @@
-"""Lookup of points in posed images for the convolutional network.
-
-:func:`summarize_views` returns the features of each view.  The other functions fuse the layers on these features and
-the pooling over the views into one kernel, without gradient; their callers have the differentiable versions in torch.
-"""
+"""Lookup of points in posed images by kernels without gradient; the callers have differentiable versions in torch."""
 
 from torch import Tensor
 

@@ -88,10 +88,7 @@ def sha256(path: str | os.PathLike) -> str:
 
 
 def known_sha256(path: str | os.PathLike) -> str:
-    """:func:`sha256`, cached for large files in ``<file>.sha256`` with the file's size and modification time.
-
-    For records only: :func:`load` and the download verify hashes that they compute.
-    """
+    """:func:`sha256`, cached for large files in ``<file>.sha256`` with size and modification time; for records only."""
     path = Path(path)
     if _size(path) < LARGE:
         return sha256(path)
@@ -107,11 +104,7 @@ def known_sha256(path: str | os.PathLike) -> str:
 
 
 def read_manifest(path: str | os.PathLike) -> Manifest:
-    """Names, shapes and metadata of a safetensors file; reads the header only.
-
-    Raises WeightsError unless the header is whole, every tensor is of floating point and the file has the length that
-    the header states.
-    """
+    """The header of a safetensors file; WeightsError unless the file is whole and all tensors are of floating point."""
     _size(path)
     with open(path, "rb") as file:
         if file.read(4) == b"PK\x03\x04":
@@ -172,10 +165,7 @@ def official_path() -> Path:
 
 
 def locate(weights: str | os.PathLike) -> Path:
-    """File of the weights called ``small``, which the package brings, or ``official``, or of a path.
-
-    Nothing is fetched: :mod:`reli3d.nn.hub` does, on request.  Raises WeightsError where there is no such file.
-    """
+    """File of the weights called ``small`` or ``official``, or of a path; nothing is fetched.  Raises WeightsError."""
     path, fix = Path(weights), "check the path"
     if os.fspath(weights) == "small":
         path, fix = SMALL, "install the package again"
@@ -242,10 +232,7 @@ def load(
 def read_tensors(
     manifest: Manifest, dtypes: Mapping[str, torch.dtype], device: torch.device | str = "cpu"
 ) -> dict[str, Tensor]:
-    """The tensors named in ``dtypes``, converted to these dtypes.
-
-    On a CPU a tensor that needs no conversion is memory-mapped: read on use, never written back.
-    """
+    """The tensors named in ``dtypes``, converted to these; on a CPU memory-mapped if none is needed."""
     with safe_open(manifest.path, "pt") as opened:
         return {name: opened.get_tensor(name).to(device, dtype) for name, dtype in dtypes.items()}
 
@@ -258,10 +245,7 @@ def save(
     dtype: torch.dtype = torch.float16,
     metadata: Mapping[str, str] | None = None,
 ) -> Manifest:
-    """Write the network's parameters as ``dtype`` (buffers as they are), its preset and license; whole or not at all.
-
-    Raises WeightsError where a value is not finite in ``dtype``: such a file would only fail later.
-    """
+    """Writes parameters as ``dtype``, preset and license, whole or not at all; WeightsError unless all are finite."""
     parameters = {name for name, _ in model.named_parameters()}
     state = {k: v.detach().to("cpu", dtype if k in parameters else v.dtype) for k, v in model.state_dict().items()}
     for name, value in state.items():

@@ -1,7 +1,4 @@
-"""Random materials for the parts of a procedural object, by their roles.
-
-Mostly grays, browns, whites and dark plastics, few saturated colors.  Colors are linear Rec. 709.
-"""
+"""Random materials by the roles of parts: mostly grays, browns, whites and dark plastics.  Colors: linear Rec. 709."""
 
 from collections.abc import Sequence
 

@@ -1,7 +1,4 @@
-"""Spatially varying materials: layers of uniform material, blended by solid patterns, with bumps.
-
-Base colors are linear Rec. 709, 0.02 to 0.9; roughness is perceptual.
-"""
+"""Layers of uniform material, blended by solid patterns, with bumps; colors linear Rec. 709, roughness perceptual."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -66,11 +63,7 @@ class Material:
 def evaluate(
     materials: Sequence[Material], points: Tensor, normals: Tensor, part: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Evaluates the materials at ``points (N, 3)`` with unit ``normals (N, 3)`` and material indices ``part (N,)``.
-
-    Returns base color ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)`` and bump-mapped normal ``(N, 3)``, float32.
-    Raises TypeError unless float32, ValueError for a wrong shape or index.
-    """
+    """Base color, roughness, metallic and bumped normal at ``points`` of material ``part``.  Raises ValueError."""
     check("points", points, shape=(len(part), 3))
     check("normals", normals, shape=(len(part), 3))
     if len(part) and not (int(part.min()) >= 0 and int(part.max()) < len(materials)):

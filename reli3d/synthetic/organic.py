@@ -1,8 +1,4 @@
-"""Families of organic shapes: animals, figures, busts, fruits, shoes, stones.
-
-Each is a signed field on a grid, negative inside, whose zero iso-surface is extracted by surface nets (Gibson 1998):
-one vertex per cell that the surface crosses, at the mean of its edge crossings, and one quad per crossed grid edge.
-"""
+"""Families of organic shapes: iso-surfaces of signed fields, negative inside, by surface nets (Gibson 1998)."""
 
 from collections.abc import Sequence
 

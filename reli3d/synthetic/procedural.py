@@ -1,8 +1,4 @@
-"""Procedural objects for training: a closed mesh, its parts and their materials from one seed.
-
-The same seed gives the same object.  ``VALIDATION_SEEDS`` and ``TEST_SEEDS`` are disjoint.  Frame: right-handed,
-+Y up, centered, longest side 1, inside the sphere of radius 0.87 of the network's frame.
-"""
+"""Procedural objects for training: mesh, parts and materials from a seed; +Y up, centered, longest side 1."""
 
 import itertools
 from dataclasses import dataclass

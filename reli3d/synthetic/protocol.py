@@ -42,10 +42,7 @@ def fields_of_view(u: np.ndarray) -> np.ndarray:
 
 
 def framed_cameras(vertices: Tensor, rng: np.random.Generator, count: int, size: int) -> Camera:
-    """``count`` random cameras of ``size`` by ``size`` pixels that frame centered ``vertices (V, 3)`` of unit scale.
-
-    Each looks at the origin from the distance at which the object leaves the padding free, and is then shifted.
-    """
+    """``count`` random cameras of ``size`` by ``size`` pixels that frame centered ``vertices (V, 3)``, then shifted."""
     fov = np.radians(fields_of_view(rng.random(count)))
     azimuth = rng.uniform(0.0, 2.0 * math.pi, count)
     low, high = (math.sin(math.radians(e)) for e in ELEVATION_DEG)
@@ -80,11 +77,7 @@ def lights_of(count: int, columns: int, rng: np.random.Generator) -> tuple[np.nd
 def protocol_sample(
     surface: Surface, maps: list[Tensor], seed: int, light: int, *, pbr: bool, size: int
 ) -> dict[str, Tensor]:
-    """The views of an object under its environment of index ``light``; a function of ``seed`` and ``light``.
-
-    maps: lat-long, ``(H, 2H, 3)`` linear.  pbr: whether the object has a ground-truth material; otherwise the sample
-    has only images, cameras and the environment.
-    """
+    """The views of an object under its environment ``light``; without ``pbr`` no ground-truth material."""
     chosen, turns = lights_of(len(maps), maps[0].shape[1], np.random.default_rng((seed, 2)))
     radiance = torch.roll(maps[chosen[light]], int(turns[light]), 1).contiguous()
     rng = np.random.default_rng((seed, 3, light))

@@ -38,10 +38,7 @@ Region = Callable[[SurfacePoints], Tensor]
 
 
 def material_sets(folder: Path) -> tuple[Path, ...]:
-    """Folders of material sets inside ``folder``: basecolor, roughness, metallic and optionally normal, JPEG or PNG.
-
-    Raises InputError if there is none or if a map is missing.
-    """
+    """Folders in ``folder`` with basecolor, roughness, metallic and optionally normal, JPEG or PNG; or InputError."""
     found = sorted({path.parent for path in folder.glob("*/basecolor.*")})
     if not found:
         raise InputError(folder, "expected folders with basecolor, roughness, metallic and normal, got none")

@@ -45,10 +45,7 @@ def crop_camera(vertices: Tensor, c2w: Tensor, size: int, padding: float) -> Ten
 
 
 def enclosed(points: Tensor, scene: RayScene) -> Tensor:
-    """Whether all of SKY_DIRECTIONS rays from each of ``points (N, 3)`` hit ``scene``, ``(N,)`` bool.
-
-    Ray parity and winding numbers are unreliable for meshes with holes and internal faces.
-    """
+    """Whether all SKY_DIRECTIONS rays from each of ``points (N, 3)`` hit ``scene``, which may have holes, ``(N,)``."""
     z = 1 - (2 * torch.arange(SKY_DIRECTIONS) + 1) / SKY_DIRECTIONS
     phi = torch.arange(SKY_DIRECTIONS) * (np.pi * (3 - 5**0.5))
     radius = (1 - z * z).sqrt()

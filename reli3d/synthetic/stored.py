@@ -62,11 +62,7 @@ def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True
 def check_samples(
     folder: Path, name: str, *, views: int = 1, points: bool = True, also: Callable[[Path], None] = lambda path: None
 ) -> list[Path]:
-    """All sample files of ``folder``, checked.  Raises InputError if one is invalid or there is none.
-
-    name: of the option or argument for error messages.  views, points: as in :func:`check_sample`.  also: additional
-    check of each file.
-    """
+    """All sample files of ``folder``, checked, also by ``also``.  name: of the option.  Raises InputError."""
     if not folder.is_dir():
         raise InputError(name, f"expected a folder of samples, got {shown(str(folder))}; make them with reli3d-data")
     files = sorted(folder.glob("*.safetensors"))

@@ -75,10 +75,7 @@ def small_preset(state: dict[str, Any]) -> LocalPreset:
 
 
 def to_resume(path: Path, stage: Stage, groups: list[dict]) -> dict[str, Any]:
-    """The checkpoint from which ``stage`` resumes.  Raises InputError if it is of another stage or network.
-
-    groups: parameter groups of the optimizer that resumes.
-    """
+    """The checkpoint from which ``stage`` resumes, with ``groups`` of parameters; InputError if it is of another."""
 
     def sizes(groups: list[dict]) -> list[tuple]:
         return [(len(group["params"]), group.get("times")) for group in groups]

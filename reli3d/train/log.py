@@ -9,10 +9,7 @@ from reli3d.errors import InputError
 
 
 class Log:
-    """``log.jsonl``: one JSON object per line; a run begins with its configuration.
-
-    On resuming, rows after ``step`` and a half-written last row are removed.
-    """
+    """``log.jsonl``: one JSON object per line, the configuration first; on resuming, later rows are removed."""
 
     def __init__(self, path: Path, step: int, configuration: Mapping[str, Any]):
         kept = []

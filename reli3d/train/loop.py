@@ -1,7 +1,4 @@
-"""The training loop of all stages: schedule, optimizer, averaged weights, checkpoints and log.
-
-A run resumes from its last checkpoint; on a CPU bitwise identically to an uninterrupted run.
-"""
+"""The training loop of all stages, which resumes from its last checkpoint; on a CPU bitwise identically."""
 
 import math
 import sys

@@ -91,10 +91,7 @@ def _material_terms(
 
 
 def perturbed(position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Points ``(N, 3)`` shifted along their normals and tilted normals, by the errors of an extracted surface.
-
-    The amplitude is drawn once for all points, since it varies between objects.
-    """
+    """Points ``(N, 3)`` shifted along their normals, and tilted normals, by the errors of an extracted surface."""
     amplitude = torch.rand((), device=position.device)
     distance = MAX_PERTURBATION[0] * amplitude * torch.randn_like(position[:, :1])
     # two of three components tilt the normal

@@ -1,7 +1,4 @@
-"""Training of the 2D U-Net alone, with many views per step, at full, half or a quarter of the resolution.
-
-Finer levels are added later, with a residual of zero (after Karras et al. 2018, Progressive Growing, 1710.10196).
-"""
+"""Training of the 2D U-Net alone, at growing resolution (after Karras et al. 2018, Progressive Growing, 1710.10196)."""
 
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, fields, replace

@@ -22,10 +22,7 @@ CACHED_CAPTURES = 64  # preprocessed captures in memory: 50 MB at 4 views
 
 
 class Captures:
-    """The object folders in a folder; those of UCO3D must have both quality scores of at least MIN_SCORE.
-
-    ``rejected``: reason by the name of each folder that is left out.  Raises InputError if no folder remains.
-    """
+    """Object folders in a folder, but those ``rejected`` (name: reason) by UCO3D's quality scores; or InputError."""
 
     def __init__(self, folder: Path, size: int = SIZE):
         reasons = {p.parent: unfit(p.parent) for p in sorted(folder.glob("*/transforms.json"))}

@@ -1,7 +1,4 @@
-"""Loss terms of the stages of the ReLi3D paper, weighted by :class:`~reli3d.train.stages.config.Weights`.
-
-A term whose ground truth a sample lacks is absent from the result instead of zero.
-"""
+"""Loss terms of the ReLi3D paper's stages; a term whose ground truth a sample lacks is absent instead of zero."""
 
 import os
 from collections.abc import Callable
@@ -32,10 +29,7 @@ def compared_colors(rendering: Rendering, target: ObjectViews, view: int) -> tup
 
 
 def gradients(rendered: Tensor, observed: Tensor) -> Tensor:
-    """Mean absolute error of image gradients of ``(H, W, 3)`` at several scales.
-
-    A substitute for LPIPS without network weights: sensitive to the position of edges, insensitive to constant offsets.
-    """
+    """Mean absolute error of image gradients of ``(H, W, 3)`` at several scales: LPIPS' substitute without weights."""
     error = (rendered - observed).movedim(-1, 0)[None]
     total = error.new_zeros(())
     for _ in range(SCALES):
@@ -47,10 +41,7 @@ def gradients(rendered: Tensor, observed: Tensor) -> Tensor:
 
 
 def lpips_distance() -> Perceptual:
-    """LPIPS (Zhang et al. 2018) with VGG features, from the package ``lpips``.
-
-    Raises InputError if the package or the weights of VGG are missing; nothing is downloaded.
-    """
+    """LPIPS (Zhang et al. 2018) with VGG features, or InputError if anything is missing; downloads nothing."""
     try:
         import lpips
     except ImportError:
@@ -83,10 +74,7 @@ def mask_error(rendering: Rendering, target: ObjectViews, view: int, *, volume: 
 
 
 def map_terms(rendering: Rendering, target: ObjectViews, view: int) -> dict[str, Tensor]:
-    """Errors of material and normal where both maps have values, weighted by the coverage of the prediction.
-
-    The weight is detached: a wrong material must not reduce the opacity.
-    """
+    """Errors of material and normal where both maps have values, weighted by the detached coverage."""
     terms = {"flat": (1.0 - rendering.bump[:, 2]).mean()} if len(rendering.bump) else {}
     if target.shown is None:
         return terms
@@ -104,11 +92,7 @@ def map_terms(rendering: Rendering, target: ObjectViews, view: int) -> dict[str,
 
 
 def light_terms(latent: Tensor, rotation: Tensor, strength: Tensor, radiance: Tensor, target: ObjectViews) -> dict:
-    """``latent``: mean squared error of the rotated latents and the strength; else ``neutral``, mean saturation.
-
-    latent: ``(L, 3)``.  rotation: ``(3, 3)``.  strength: ``()``.  radiance: ``(K, 3)`` in directions uniform over the
-    sphere.
-    """
+    """``latent``: squared error of rotated latents and strength; else ``neutral``: saturation of ``radiance``."""
     if target.latent is None or target.strength is None:
         mean = radiance.mean(-1, keepdim=True)
         return {"neutral": (radiance - mean).abs().mean() / mean.detach().mean().clamp(min=1e-3)}

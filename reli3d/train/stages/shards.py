@@ -35,10 +35,7 @@ def packed(source: Samples | Captures, index: int) -> tuple[str, bytes]:
 def pack(
     source: Samples | Captures, folder: Path, *, each: int = 64, progress: Callable[[str], None] = lambda line: None
 ) -> None:
-    """Writes the objects of ``source`` to ``NNNNNN.tar``, ``each`` per file; existing files are kept.
-
-    Raises InputError if the package ``webdataset`` is missing.
-    """
+    """Writes the objects of ``source`` to ``NNNNNN.tar``, ``each`` per file; existing files are kept."""
     try:
         from webdataset import TarWriter
     except ImportError:

@@ -51,10 +51,7 @@ def shader_of(model: Reconstructor, code: Code, stage: StageConfig, seed: int) -
 def renderings(
     model: Reconstructor, code: Code, drawn: Draw, stage: StageConfig
 ) -> tuple[list[Rendering], dict[str, Tensor]]:
-    """Renderings of the target views, and the regularization terms of the geometry.
-
-    If the field has no surface yet there are no renderings, and the term ``sign`` creates one.
-    """
+    """Renderings of the target views, none without a surface, and the regularization terms of the geometry."""
     target, size = drawn.targets, drawn.targets.images.shape[1]
     cameras = [Camera(target.c2w[v], target.intrinsics[v], size, size) for v in range(len(target))]
     if stage.renderer == "volume":
@@ -71,10 +68,7 @@ def renderings(
 def object_losses(
     model: Reconstructor, drawn: Draw, stage: StageConfig, distance: losses.Perceptual, *, bfloat16: bool = False
 ) -> dict[str, Tensor]:
-    """Unweighted scalar terms of one object, by the names of ``stage.weights``; terms without ground truth are absent.
-
-    Terms of several target views are averaged over the views that have them.
-    """
+    """Unweighted terms of one object by the names of ``stage.weights``, averaged over the views that have them."""
     code = encode(model, drawn, bfloat16=bfloat16)
     shown, terms = renderings(model, code, drawn, stage)
     target = drawn.targets
