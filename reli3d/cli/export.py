@@ -79,7 +79,7 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
     origin: list[float] = []
     parts = read_glb(args.glb, notes=notes, origin=origin if args.format == "glb" else None)
     for note in notes:
-        print(f"reli3d-export: {note}", file=sys.stderr)
+        print(f"reli3d export: {note}", file=sys.stderr)
     if len(parts) != 1:
         raise InputError(args.glb, f"expected a GLB with one surface, got {len(parts)}")
     asset = parts[0]

@@ -61,13 +61,13 @@ class Row:
 
 
 Rows = Generator[Row, None, None]
+Submit = Callable[[Item], tuple[Future, object]]
 
 
 def make(job: Job, item: Item, failed: Callable[[Exception], None] = lambda error: None, *, writes: bool = True) -> Row:
     """Makes one object; an error is returned as a row, and its traceback is written to a log file next to the target.
 
-    failed: called with an error other than InputError.  writes: whether the job writes a result to the target, which
-    replaces the log of an earlier run and whose ``run_info.json`` is read.
+    failed: called with an error other than InputError.  writes: whether the job replaces the target with a result.
     """
     began = time.monotonic()
     try:
@@ -95,8 +95,7 @@ def collect(
 ) -> tuple[list[Row], int]:
     """Collects all rows; returns them and the exit code.
 
-    Objects that are not done are reported on stderr.  done: called with the row of each object that is done.  summary:
-    CSV file of the rows in the order of ``items``, also written by an interrupted command.
+    done: called with the row of each object that is done.  summary: CSV file of the rows in the order of ``items``.
     """
     ended: list[Row] = []
     try:
@@ -221,12 +220,7 @@ def _on_ray(ray, start: Callable[[], Job], items: Sequence[Item], gpu: bool) -> 
 
 
 def _rows(
-    submit: Callable[[Item], tuple[Future, object]],
-    items: Sequence[Item],
-    limit: Callable[[], int],
-    crash: type[Exception],
-    *,
-    alone: bool,
+    submit: Submit, items: Sequence[Item], limit: Callable[[], int], crash: type[Exception], *, alone: bool
 ) -> Rows:
     """Keeps ``limit()`` objects submitted; one that raises ``crash`` is retried.
 

@@ -110,7 +110,6 @@ def parser() -> argparse.ArgumentParser:
 @command("reli3d-render")
 def main(argv: list[str] | None = None) -> int:
     args = _completed(parser().parse_args(argv))
-    _check(args)
     files = [str(path) for path in render_files(args)]
     record = {name: getattr(args, name) for name in ("frames", "size", "samples", "supersampling")}
     print(json.dumps({"files": files, **record}) if args.json else "\n".join(files))
@@ -118,7 +117,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _completed(args: argparse.Namespace) -> argparse.Namespace:
-    """The arguments with defaults that depend on others; ``args.file``: the file named by ``--output``, or None."""
+    """The arguments, checked, with defaults that depend on others; ``args.file``: the file of ``--output``, or None."""
+    from reli3d.cli.infer import choose_device
+    from reli3d.output.folder import check_folder
+
     ending = args.output.suffix.lower().removeprefix(".")
     args.file = args.output if ending in FORMATS and not args.output.is_dir() else None
     if args.file is not None:
@@ -133,13 +135,6 @@ def _completed(args: argparse.Namespace) -> argparse.Namespace:
     samples, supersampling = QUALITIES[args.quality]
     args.samples = tuple(args.samples or samples)
     args.supersampling = args.supersampling if args.supersampling is not None else supersampling
-    return args
-
-
-def _check(args: argparse.Namespace) -> None:
-    from reli3d.cli.infer import choose_device
-    from reli3d.output.folder import check_folder
-
     check_ranges(args, frames=(1, 3600), size=(1, 8192), supersampling=(1, 16), plan=(1, 65536), seed=(0, 10**9))
     check_ranges(args, fov=(1, 150), elevation=(-89, 89), azimuth=(-3600, 3600), exposure=(-32, 32))
     if not all(0 <= k <= 65536 for k in args.samples) or sum(args.samples) == 0:
@@ -158,6 +153,7 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError("--distance", f"expected a positive length, got {args.distance}")
     choose_device(args.device)
     check_folder(args.output)
+    return args
 
 
 def render_files(args: argparse.Namespace) -> list[Path]:
@@ -198,10 +194,9 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         eye = center + distance * torch.tensor(offset, device=device)
         camera = Camera.from_fov(look_at(eye, center, up), math.radians(args.fov), args.size, args.size)
         if args.plan is not None and frame == 0:
-            relative = args.format != "exr"
-            counts: Any = {"total": args.plan, "relative": relative, "options": options}
+            given: Any = {"total": args.plan, "relative": args.format != "exr", "options": options, **shown}
             try:
-                plan = plan_render(parts, camera, environment, **counts, **shown)
+                plan = plan_render(parts, camera, environment, **given)
             except ValueError as error:  # no ray hits the object
                 raise InputError("--plan", f"{error}; bring the camera nearer") from None
             args.samples = plan.samples

@@ -159,13 +159,15 @@ def small_network(start: str | None, resumed: Path) -> "LocalReconstructor":
     """
     from reli3d.nn import weights
     from reli3d.nn.local import LocalReconstructor
+    from reli3d.nn.presets import SMALL, LocalPreset, from_json
     from reli3d.train import checkpoint
     from reli3d.train.pixels import missing_parameters
 
     if start is None or start.endswith(".pt"):
         known = Path(start) if start else resumed
         state = checkpoint.load(known) if known.exists() or start else {}
-        model = LocalReconstructor(checkpoint.small_preset(state))
+        preset = from_json(state["preset"]) if "preset" in state else SMALL
+        model = LocalReconstructor(preset if isinstance(preset, LocalPreset) else SMALL)
         if start:
             missing = missing_parameters(model.preset, state["average"])
             checkpoint.load_average(known, model, state, missing)

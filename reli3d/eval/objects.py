@@ -58,10 +58,10 @@ def load_reference(
     points = torch.cat([p.mesh.vertices for p in parts])
     low, high = points.amin(0), points.amax(0)
     scale = 1.0 / float((high - low).max())
-    vertices = [((p.mesh.vertices - (low + high) / 2) * scale).contiguous() for p in parts]
-    moved = [replace(p, mesh=replace(p.mesh, vertices=v)) for p, v in zip(parts, vertices, strict=True)]
+    move = lambda mesh: replace(mesh, vertices=((mesh.vertices - (low + high) / 2) * scale).contiguous())  # noqa: E731
+    moved = [replace(part, mesh=move(part.mesh)) for part in parts]
     drawn = sample_cameras(np.random.default_rng((seed, 5)), inputs + HELD_OUT_VIEWS)
-    poses = [(torch.as_tensor(c2w, device="cpu"), float(fov)) for c2w, fov in zip(*drawn, strict=True)]
+    poses = zip(torch.as_tensor(drawn[0], device="cpu"), drawn[1].tolist(), strict=True)
     cameras = [Camera.from_fov(c2w, fov, size, size) for c2w, fov in poses]
     return ReferenceObject(path.stem, moved, light, other, cameras)
 
@@ -178,8 +178,7 @@ def table(
 ) -> tuple[dict, list[dict], Tensor]:
     """Means for each number of views, the metrics of every object, and the image sheet of the last number of views.
 
-    lights: assigned to the objects in turn; the next one is used for relighting.  size: pixels per side of the views.
-    seed: of the first object; the next has the next seed.
+    lights: assigned to the objects in turn; the next one relights.  size: pixels per side.  seed: of the first object.
     """
     rows: list[dict] = []
     rows_of_images = []

@@ -1,7 +1,6 @@
 """Depth of pixels by comparing the views at hypotheses along each pixel's ray, around the depth predicted per view.
 
-Sources: Yao et al. 2018, MVSNet, arXiv 1804.02505 (cost volume, regularized by 3D convolutions, expected depth); Guo et
-al. 2019, arXiv 1903.04025 (correlation of features in groups).
+Sources: Yao et al. 2018, MVSNet, arXiv 1804.02505 (cost volume); Guo et al. 2019, arXiv 1903.04025 (groups).
 """
 
 import torch

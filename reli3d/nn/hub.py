@@ -1,7 +1,6 @@
 """The published checkpoint from the Hugging Face hub: fetched on request only, then converted.
 
-``huggingface_hub`` (the extra ``hub``) resumes the transfer and sends the user's token.  Its settings apply:
-``HF_ENDPOINT``, ``HF_TOKEN``, ``HF_HUB_OFFLINE`` and the proxies of the environment.
+``huggingface_hub`` (extra ``hub``) obeys ``HF_ENDPOINT``, ``HF_TOKEN``, ``HF_HUB_OFFLINE`` and the proxies.
 """
 
 import errno

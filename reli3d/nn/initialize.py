@@ -16,8 +16,7 @@ START_DENSITY_OFFSET = 2.0  # raw density below the surface's at the start: ever
 def initialize(model: nn.Module) -> None:
     """Fill the parameters of a :class:`reli3d.nn.model.Reconstructor` in place, from torch's global generator.
 
-    Linear weights are truncated normal; modulations start as the identity, outputs of residual branches are scaled
-    down with the number of branches; normal and deformation heads start near zero; the density starts outside.
+    Linear weights are truncated normal; modulations start as the identity; the density starts outside.
     """
     for module in model.modules():
         if isinstance(module, nn.Linear):

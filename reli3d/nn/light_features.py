@@ -1,8 +1,7 @@
 """Lighting features at surface points, which let the material heads separate shading from base color.
 
-Two estimates: the irradiance of the predicted environment, and the observed brightness as a function of the normal.
-The second is a least-squares fit: over many points the base color averages out and the irradiance remains (Ramamoorthi
-and Hanrahan 2001: diffuse irradiance is well approximated by nine spherical harmonics).
+Two estimates: the irradiance of the predicted environment, and a least-squares fit of the observed brightness to nine
+spherical harmonics of the normal (Ramamoorthi and Hanrahan 2001), in which the base color averages out.
 """
 
 from dataclasses import dataclass
@@ -66,8 +65,7 @@ def brightness_at(normal: Tensor, observed: Tensor) -> Tensor:
 def brightness_over_normal(color: Tensor, visible: Tensor, normal: Tensor) -> Tensor:
     """Ridge regression of linear ``color (N, 3)`` on the :func:`harmonics` of unit ``normal (N, 3)``, ``(9, 3)``.
 
-    visible: ``(N,)``, weight of each point.  The fit is divided by the weighted mean color; it is the constant 1 if no
-    point is visible or all are black.
+    visible: ``(N,)``, weights.  Relative to the weighted mean color; the constant 1 where that is black.
     """
     weight = (visible + 1e-6)[:, None]
     total, mean = weight.sum(), (weight * color).sum(0) / weight.sum()

@@ -42,8 +42,7 @@ class Code:
 class Reconstructor(nn.Module):
     """The ReLi3D network with the sizes of ``preset``, its parameters ready for training from scratch.
 
-    Built under ``torch.device("meta")`` it allocates nothing.  The trunk computes in its parameters' dtype (see
-    :meth:`to_compute`); heads, environment decoder and every output are float32.
+    On the meta device it allocates nothing.  The trunk computes in its parameters' dtype, the rest in float32.
     """
 
     def __init__(self, preset: Preset):

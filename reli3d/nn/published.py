@@ -1,7 +1,6 @@
 """The published checkpoint's names in ours.
 
-A name keeps its tail; its front changes by the first row that fits.  The published model registered the modulations of
-the norms of every encoder layer a second time under ``modulations``: 2i and 2i + 1 are those of layer i.
+A name keeps its tail.  ``modulations`` 2i and 2i + 1 are those of the norms of layer i, which are stored twice.
 """
 
 import re

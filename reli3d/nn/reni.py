@@ -29,9 +29,8 @@ def reni_frame(directions: Tensor) -> Tensor:
 class _VnInvariant(nn.Module):
     """Two rotation invariants of a 2D vector p: <p, out_o> of a small vector-neuron network.
 
-    Every channel of that network is a multiple of p, so only the factors are computed: with alpha = W a, beta = U a and
-    n = |p| the result is alpha n^2, minus the component along k = beta p where alpha and beta differ in sign.  As in
-    the published network, the projection uses k and not its unit vector.
+    Every channel of it is a multiple of p: with alpha = W a, beta = U a and n = |p| the result is alpha n^2, minus the
+    component along k = beta p (not its unit vector, as published) where alpha and beta differ in sign.
     """
 
     def __init__(self):

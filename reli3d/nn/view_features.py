@@ -130,8 +130,7 @@ class ViewFeatures(nn.Module):
     ) -> Tensor:
         """Features of ``points (N, 3)`` [model frame].
 
-        visible: ``(N, V)``, 1 where a surface point is visible, 0 where it is occluded; None for points in free space.
-        normal: ``(N, 3)`` unit, outward; required with ``visible``.  Gradients reach the tokens.
+        visible: ``(N, V)``, 1 where a view shows a surface point; None in free space.  normal: unit, with it.
         """
         first, activation, last = linear_of(self.per_view, 0), self.per_view[1], self.per_view[2]
         channels = self.tokens.out_features

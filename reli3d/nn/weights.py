@@ -1,7 +1,6 @@
 """Weights in files: safetensors whose manifest is checked before anything is allocated; published files converted.
 
-A file of ours carries its preset, its license and what else the writer states in the header, so it loads by itself.  A
-pickle checkpoint is only ever read by torch's restricted reader and turned into such a file.
+A file of ours carries preset and license in its header.  Pickles are only read by torch's restricted reader.
 """
 
 import contextlib
@@ -267,8 +266,7 @@ def convert_checkpoint(
 ) -> Manifest:
     """Turn a published training checkpoint into a safetensors file of ours, float32 as it is.
 
-    The checkpoint's tensors stay mapped.  Only torch's restricted reader touches the pickle: anything that would run
-    code is rejected.  Raises WeightsError, and then leaves no file.
+    Only torch's restricted reader touches the pickle: no code is run.  Raises WeightsError, and then leaves no file.
     """
     state = published_state(read_checkpoint(source), source)
     check_keys(source, _shapes(state), shapes(preset))

@@ -73,8 +73,7 @@ def _read_set(folder: Path, side: int) -> tuple[Tensor, Tensor, Tensor]:
 class RefinishedSurface:
     """``base`` with random materials and base colors: a ``Surface`` of :mod:`reli3d.synthetic.samples`.
 
-    sets: from :func:`material_sets`.  measured: whether roughness and metallic of ``base`` are ground truth rather than
-    placeholders.  texels: resolution of a material set per unit of length, about two per pixel of a view.
+    measured: whether the finish of ``base`` is ground truth.  texels: of a material set per unit of length.
     """
 
     def __init__(self, base: Surface, sets: Sequence[Path], rng: np.random.Generator, *, measured: bool, texels: int):

@@ -1,8 +1,7 @@
 """Training samples: an object under one environment, rendered in several views, with ground truth at points.
 
-A sample is a dictionary of tensors, stored as one safetensors file.  ``docs/model.md``, "A sample", lists its entries
-with shapes and units.  It has ``V`` views of ``S`` by ``S`` pixels, cropped to the object.  World +Y up, object
-centered, longest side 1.  Radiance is scaled by the exposure of the first view.
+A sample is a dictionary of tensors, stored as one safetensors file; ``docs/model.md``, "A sample", lists its entries.
+World +Y up, object centered, longest side 1.  Radiance is scaled by the exposure of the first view.
 """
 
 from dataclasses import replace
@@ -140,8 +139,7 @@ def synthesize(
 ) -> dict[str, Tensor]:
     """One sample of an object under the lat-long map ``light`` ``(H, 2H, 3)``, turned by a random yaw.
 
-    views_only: as in :func:`render_sample`.  finish_known: stored for each view, False if roughness and metallic of the
-    object are placeholders, as those of a scan are; training then leaves them out.
+    finish_known: stored for each view; False if roughness and metallic of the object are placeholders.
     """
     environment = Environment(torch.roll(light, int(rng.integers(light.shape[1])), 1).contiguous())
     c2w = torch.as_tensor(np.asarray(sample_cameras(rng, views)[0]), dtype=torch.float32)

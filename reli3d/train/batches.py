@@ -115,7 +115,6 @@ def load_sample(
     """Reads up to ``views`` random views of a file, ``points`` volume points and half as many surface points.
 
     augment: False takes the first views unchanged.  lights: ``(n, H, 2H, 3)``, for relighting some of the samples.
-    device: of the sample and of the relighting.
     """
     with safe_open(path, "pt", device=str(device)) as file:
         stored = file.get_slice

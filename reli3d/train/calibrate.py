@@ -115,8 +115,7 @@ def _reduced(values: Tensor, step: int) -> Tensor:
 def normal_map_error(got: Tensor, filled: Tensor, wanted: Tensor, masked: Tensor) -> float:
     """Squared error of a normal map over the area of the object, as a logarithm; at most MAX_ERROR.
 
-    got, wanted: normals ``(P, 3)`` of any length.  filled, masked: ``(P,)`` bool, the pixels of the mesh and of the
-    object; both maps are zero elsewhere, so that a pixel of only one of them has the error 1.
+    got, wanted: normals ``(P, 3)`` of any length.  filled, masked: ``(P,)`` bool, the pixels of mesh and object.
     """
     got, wanted = functional.normalize(got, dim=-1), functional.normalize(wanted, dim=-1)
     difference = (got * filled[:, None] - wanted * masked[:, None]).square().sum()

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from reli3d.errors import InputError, shown
 from reli3d.io.files import file_size
-from reli3d.nn.presets import SMALL, LocalPreset, from_json, to_json
+from reli3d.nn.presets import to_json
 from reli3d.nn.weights import BROKEN_TORCH_FILE, check_keys
 from reli3d.train.stage import Stage
 
@@ -66,12 +66,6 @@ def load(path: Path) -> dict[str, Any]:
             path, f"step: expected a count, got {shown(state.get('step'))}; remove the file to start again"
         )
     return {"stage": "", "seconds": 0.0, "measures": {}, **state}
-
-
-def small_preset(state: dict[str, Any]) -> LocalPreset:
-    """Preset of a checkpoint of the small network; SMALL where ``state`` has none, or that of another network."""
-    preset = from_json(state["preset"]) if "preset" in state else SMALL
-    return preset if isinstance(preset, LocalPreset) else SMALL
 
 
 def to_resume(path: Path, stage: Stage, groups: list[dict]) -> dict[str, Any]:

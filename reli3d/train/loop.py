@@ -77,9 +77,8 @@ def update_average(average: dict[str, Tensor], model: nn.Module, decay: float) -
 def train(stage: Stage, options: Options, workers: Workers | None = None) -> None:
     """Trains ``stage.model`` in place to the end of the schedule; resumes from ``output/state.pt`` if it exists.
 
-    workers: processes that divide each batch; all start from the same parameters, the first one writes files.  A step
-    whose gradients are not finite is skipped; ``options.bad_steps`` such steps in a row raise RuntimeError.  Raises
-    InputError for a batch size that the processes do not divide and for a checkpoint of another stage.
+    workers: processes that divide each batch; the first one writes files.  A step whose gradients are not finite is
+    skipped; ``options.bad_steps`` in a row raise RuntimeError.  Raises InputError for a wrong batch size or checkpoint.
     """
     workers = workers or Workers()
     model, folder, first = stage.model, Path(options.output), workers.rank == 0

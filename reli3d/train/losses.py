@@ -111,9 +111,8 @@ def excess_entropy(value: Tensor, target: Tensor) -> Tensor:
 def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
     """Scale-invariant difference of base colors ``(N, 3)``, sRGB: ``log(1 + mse / PATTERN_FLOOR)``.
 
-    The error is that of sRGB values after the best factor per channel in linear light, because exposure makes the
-    absolute albedo ambiguous.  Gradients also flow through the factor.  The logarithm balances objects with weak and
-    with strong patterns.
+    After the best factor per channel in linear light, because exposure makes the absolute albedo ambiguous.  The
+    logarithm balances objects with weak and with strong patterns.
     """
     p, t = srgb_to_linear(color), srgb_to_linear(target)
     factor = (p * t).sum(0) / p.square().sum(0).clamp(min=1e-4)

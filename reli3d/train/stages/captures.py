@@ -65,6 +65,4 @@ def capture_views(views: Views, size: int) -> ObjectViews:
         x, y = ((at - new[k]) * (old[k - 2] / new[k - 2]) + old[k] for k in (2, 3))
         valid.append(((y >= 0) & (y <= mask.shape[0]))[:, None] & ((x >= 0) & (x <= mask.shape[1])))
     background = all(has_background(i, m) for i, m in zip(views.images, views.masks, strict=True))
-    return ObjectViews(
-        cut.images, cut.masks, cut.c2w, cut.intrinsics, background=background, valid=torch.stack(valid).float()
-    )
+    return ObjectViews(cut.images, cut.masks, cut.c2w, cut.intrinsics, background, torch.stack(valid).float())

@@ -34,8 +34,7 @@ def display(radiance: Tensor) -> Tensor:
 def lobes(model: Reconstructor, code: Code, count: int) -> SphericalGaussians:
     """The predicted environment as ``count`` equal lobes on a Fibonacci spiral, with the radiance along their axes.
 
-    Constant lighting is reproduced exactly: equal lobes of sharpness s sum to count (1 - exp(-2 s)) / (2 s).  Features
-    smaller than a lobe, such as the sun, are aliased.
+    Constant lighting is exact: equal lobes of sharpness s sum to count (1 - exp(-2 s)) / (2 s).
     """
     k = torch.arange(count, dtype=torch.float64, device=code.latent.device)
     height = 1.0 - 2.0 * (k + 0.5) / count

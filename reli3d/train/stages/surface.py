@@ -55,8 +55,7 @@ def query_heads(model: Reconstructor, code: Code, points: Tensor, heads: tuple[s
 def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None:
     """The surface on a grid of ``resolution`` cubes per side; None if the field has only one sign.
 
-    Gradients reach the network: after an evaluation at all grid points without gradient, the field is evaluated again
-    at the corners of the cubes that the surface crosses.  Field values are divided by the density threshold.
+    Gradients reach the network: field values, over the density threshold, are evaluated again near the surface.
     """
     radius, threshold = model.preset.radius, model.preset.density_threshold
     axis = torch.linspace(-radius, radius, resolution + 1, device=code.latent.device)
@@ -102,8 +101,7 @@ def seed_surface(model: Reconstructor, code: Code) -> Tensor:
 def render_surface(model: Reconstructor, code: Code, found: Surface, camera: Camera, shader: Shader) -> Rendering:
     """Rendering of one object from ``camera``: one ray per pixel, antialiased silhouettes.
 
-    Gradients reach the network through the head outputs at the hits, the normals of the mesh and the silhouettes.  The
-    hit positions are detached: their derivative grows without bound towards the silhouette.
+    Gradients reach heads, normals and silhouettes; hit positions are detached: their derivative is unbounded.
     """
     mesh = found.mesh
     hits, _, directions = primary_hits(found.scene, camera)
