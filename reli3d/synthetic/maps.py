@@ -37,6 +37,9 @@ def load_maps(path: Path) -> tuple[Tensor, list[str]]:
     if len(names) != len(env):
         raise InputError(path, f"names: expected {len(env)}, one a map, got {len(names)}")
     maps = torch.as_tensor(env.astype(np.float32)).permute(0, 3, 1, 2)
+    bad = [name for name, light in zip(names, maps) if not bool(((light >= 0) & light.isfinite()).all())]
+    if bad:
+        raise InputError(path, f"env: expected finite radiance of at least 0, got others in {', '.join(bad[:3])}")
     maps = torch.nn.functional.interpolate(maps, (ROWS, 2 * ROWS), mode="area").permute(0, 2, 3, 1)
     return quarter_turn(maps, -1).contiguous(), names  # the file has -Z at the horizontal center
 
