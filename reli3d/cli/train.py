@@ -246,14 +246,13 @@ def export(args: argparse.Namespace, stage: "Stage") -> "LocalReconstructor | Re
     from reli3d.nn.local import LocalReconstructor
     from reli3d.train import checkpoint
     from reli3d.train.calibrate import calibrate
+    from reli3d.train.stages.stage import no_surface
 
     model: Any = stage.model.cpu()
     path = args.output / "state.pt"
     state = checkpoint.load_average(path, model)
     model.eval()
     if state["measures"].get("surface", 1.0) == 0.0:
-        from reli3d.train.stages.stage import no_surface
-
         raise no_surface(path)
     if isinstance(model, LocalReconstructor):
         samples = args.validation if "validation" in args else args.data[0]

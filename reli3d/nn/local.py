@@ -290,7 +290,7 @@ class LocalField:
         return -hull_distance(points, self.maps.silhouette, self.maps.camera) / self.model.preset.softness
 
     def grid_bound(self, axis: Tensor, far: float) -> Tensor:
-        """:meth:`bound` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; only above ``far`` if it is."""
+        """:meth:`bound` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; above ``far`` any such value."""
         softness = self.model.preset.softness
         return -hull_grid(axis, self.maps.silhouette, self.maps.camera, far=far * softness) / softness
 

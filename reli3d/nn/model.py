@@ -9,20 +9,13 @@ from torch import Tensor, nn
 
 from reli3d._bridge import check
 from reli3d.geometry.triplane import sample_triplane
+from reli3d.nn import tokenizers
 from reli3d.nn.blocks import linear_of
 from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
 from reli3d.nn.illumination import Illumination
 from reli3d.nn.initialize import initialize
 from reli3d.nn.presets import Preset
 from reli3d.nn.reni import EnvironmentDecoder, reni_frame
-from reli3d.nn.tokenizers import (
-    CameraEmbedder,
-    ImageTokenizer,
-    PixelShuffleUpsampler,
-    TriplaneBank,
-    camera_vector,
-    patch_grid,
-)
 from reli3d.nn.transformer import TwoStreamTransformer
 
 BACKGROUND = 0.5  # gray behind the object in the object encoder's images, sRGB
@@ -49,11 +42,11 @@ class Reconstructor(nn.Module):
         super().__init__()
         self.preset = preset
         width = preset.encoder.hidden
-        self.camera = CameraEmbedder(preset.camera_width)
-        self.encoder = ImageTokenizer(preset.encoder, preset.camera_width)
-        self.bank = TriplaneBank(width, preset.plane_size)
+        self.camera = tokenizers.CameraEmbedder(preset.camera_width)
+        self.encoder = tokenizers.ImageTokenizer(preset.encoder, preset.camera_width)
+        self.bank = tokenizers.TriplaneBank(width, preset.plane_size)
         self.backbone = TwoStreamTransformer(preset.backbone, width)
-        self.upsampler = PixelShuffleUpsampler(preset.upsampler, width)
+        self.upsampler = tokenizers.PixelShuffleUpsampler(preset.upsampler, width)
         self.illumination = Illumination(preset.illumination, preset.reni.latents, preset.camera_width, width)
         self.environment = EnvironmentDecoder(preset.reni)
         self.heads = Heads(3 * preset.upsampler.channels, preset.head_width)
@@ -102,7 +95,7 @@ class Reconstructor(nn.Module):
         check("intrinsics", intrinsics, shape=(*lead, 4), like=images)
         if 0 in lead:
             raise ValueError(f"images: expected at least one object and one view, got {lead}")
-        camera = self.camera(camera_vector(c2w, intrinsics, images.shape[2]))
+        camera = self.camera(tokenizers.camera_vector(c2w, intrinsics, images.shape[2]))
         extra = lambda sizes, mask: mask.unsqueeze(2).to(self.dtype) if sizes.mask_channel else None  # noqa: E731
         composite = torch.lerp(torch.full_like(images, BACKGROUND), images, masks.unsqueeze(-1))
         tokens = self.encoder(composite, camera, extra(self.preset.encoder, masks))
@@ -113,7 +106,7 @@ class Reconstructor(nn.Module):
         with_mask = extra(self.preset.illumination.encoder, shown)
         light = self.illumination(images * shown.unsqueeze(-1), with_mask, camera, planes)
         triplane = self.upsampler(planes).float().movedim(2, -1).contiguous().movedim(-1, 2)  # as sample_triplane reads
-        return Code(triplane, patch_grid(tokens), *light)
+        return Code(triplane, tokenizers.patch_grid(tokens), *light)
 
     def decode_environment(self, code: Code, height: int | None = None) -> Tensor:
         """Linear radiance ``(B, H, 2H, 3)``, upper edge +Y, horizontal center +X; default height the preset's."""

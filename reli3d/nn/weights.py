@@ -231,7 +231,7 @@ def load(
 def read_tensors(
     manifest: Manifest, dtypes: Mapping[str, torch.dtype], device: torch.device | str = "cpu"
 ) -> dict[str, Tensor]:
-    """The tensors named in ``dtypes``, converted to these; on a CPU memory-mapped if none is needed."""
+    """The tensors named in ``dtypes``, converted to these; on a CPU memory-mapped where nothing changes."""
     with safe_open(manifest.path, "pt") as opened:
         return {name: opened.get_tensor(name).to(device, dtype) for name, dtype in dtypes.items()}
 

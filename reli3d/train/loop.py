@@ -86,19 +86,17 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
     if options.batch % workers.count:
         raise InputError("batch", f"expected a multiple of the {workers.count} processes, got {options.batch}")
     folder.mkdir(parents=True, exist_ok=True)
-    state: dict = {}
-    if path.exists():
-        state = checkpoint.to_resume(path, stage, parameter_groups(stage, options.weight_decay))
-        model.load_state_dict(state["model"])
     groups = parameter_groups(stage, options.weight_decay)
     trained = [p for group in groups for p in group["params"]]
     optimizer = stage.optimizer(groups, lr=options.rate, betas=(0.9, 0.98), fused=True)
     step, seconds, average = 0, 0.0, {k: v.detach().clone() for k, v in model.state_dict().items()}
-    if state:
+    if path.exists():
+        state = checkpoint.to_resume(path, stage, groups)
+        model.load_state_dict(state["model"])
+        optimizer.load_state_dict(state["optimizer"])
         step, seconds = state["step"], state["seconds"]
         average = {k: v.to(average[k].device) for k, v in state["average"].items()}
-        optimizer.load_state_dict(state["optimizer"])
-        state.clear()
+        del state
     measures = stage.measures()
     about = {"stage": stage.name, "processes": workers.count, **asdict(options), **stage.configuration}
     log = Log(folder / "log.jsonl", step, about) if first else None

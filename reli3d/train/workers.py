@@ -39,7 +39,7 @@ class Workers:
         return flat[-len(values) :].to(values.device, copy=True)
 
     def leave(self) -> None:
-        """Destroys the group and exits this process, if others are: Gloo's threads abort a normal shutdown."""
+        """With several processes destroys the group and exits with 0: Gloo's threads would abort a normal exit."""
         if self.count == 1:
             return
         distributed.barrier()
