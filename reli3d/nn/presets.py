@@ -38,21 +38,19 @@ class _Checked:
 
     def __post_init__(self):
         for name, kind in typing.get_type_hints(type(self)).items():
-            self._check(name, kind, getattr(self, name))
-
-    def _check(self, name: str, kind: type, value) -> None:
-        low, high = LIMITS.get(name, (1, MAX_SIZE))
-        if kind in (int, float):
-            what = "an integer" if kind is int else "a number"
-            known = type(value) in (int, kind) and low <= value <= high
-            _expect(known, name, f"{what} from {low:g} to {high:g}", value)
-        elif typing.get_origin(kind) is tuple:
-            known = isinstance(value, tuple) and 1 <= len(value) <= MAX_LEVELS and all(type(v) is int for v in value)
-            widths = known and all(2 <= v < 16 or 16 <= v <= MAX_SIZE and v % 8 == 0 for v in value)
-            expected = f"1 to {MAX_LEVELS} widths, each 2 to 15 or a multiple of 8 up to {MAX_SIZE}"
-            _expect(widths, name, expected, value)  # normalized over groups of eight channels
-        else:
-            _expect(isinstance(value, kind), name, kind.__name__, value)
+            value, (low, high) = getattr(self, name), LIMITS.get(name, (1, MAX_SIZE))
+            if kind in (int, float):
+                expected = f"{'an integer' if kind is int else 'a number'} from {low:g} to {high:g}"
+                holds = type(value) in (int, kind) and low <= value <= high
+            elif typing.get_origin(kind) is tuple:  # widths, normalized over groups of eight channels
+                expected = f"1 to {MAX_LEVELS} widths, each 2 to 15 or a multiple of 8 up to {MAX_SIZE}"
+                holds = isinstance(value, tuple) and 1 <= len(value) <= MAX_LEVELS
+                holds = holds and all(
+                    type(v) is int and (2 <= v < 16 or 16 <= v <= MAX_SIZE and v % 8 == 0) for v in value
+                )
+            else:
+                expected, holds = kind.__name__, isinstance(value, kind)
+            _expect(holds, name, expected, value)
 
 
 def _expect(holds: bool, name: str, expected: str, value) -> None:

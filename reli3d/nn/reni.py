@@ -73,16 +73,11 @@ class _Decoder(nn.Module):
         self.fc = nn.Linear(sizes.width, 3)
 
     def forward(self, features: Tensor, condition: Tensor) -> Tensor:
-        x = self.residual_projection(positional_encoding(features))
+        s = (features.unsqueeze(-1) * features.new_tensor(FREQUENCIES)).flatten(-2)  # frequencies vary fastest
+        x = self.residual_projection(torch.cat([s.sin(), (s + 0.5 * math.pi).sin(), features], dim=-1))
         for layer in self.layers:
             x = layer(x, condition)
         return self.fc(x)
-
-
-def positional_encoding(x: Tensor) -> Tensor:
-    """``(..., F)`` to ``(..., 5 F)``: sines, sines shifted by pi / 2, then ``x``; frequencies vary fastest."""
-    s = (x.unsqueeze(-1) * x.new_tensor(FREQUENCIES)).flatten(-2)
-    return torch.cat([s.sin(), (s + 0.5 * math.pi).sin(), x], dim=-1)
 
 
 class ReniField(nn.Module):

@@ -120,13 +120,12 @@ class MainBlock(nn.Module):
     def __init__(self, width: int, heads: int, basic_blocks: int, experts: int):
         super().__init__()
         self.fuse_block_in = FuseBlock(width, heads)
-        self.transformer_block = nn.ModuleList(self._basic(width, heads, experts) for _ in range(basic_blocks))
+        feed_forward = lambda: Experts(width, experts) if experts else FeedForward(width)  # noqa: E731
+        self.transformer_block = nn.ModuleList(
+            BasicBlock(width, Attention(width, heads), Attention(width, heads), feed_forward())
+            for _ in range(basic_blocks)
+        )
         self.fuse_block_out = FuseBlock(width, heads)
-
-    @staticmethod
-    def _basic(width: int, heads: int, experts: int) -> BasicBlock:
-        attentions = Attention(width, heads), Attention(width, heads)
-        return BasicBlock(width, *attentions, Experts(width, experts) if experts else FeedForward(width))
 
     def forward(self, latents: Tensor, planes: Tensor, views: Tensor) -> tuple[Tensor, Tensor]:
         latents = self.fuse_block_in(latents, planes)
