@@ -180,8 +180,7 @@ def table(
 
     lights: assigned to the objects in turn; the next one relights.  size: pixels per side.  seed: of the first object.
     """
-    rows: list[dict] = []
-    rows_of_images = []
+    rows, rows_of_images = list[dict](), []
     for k, path in enumerate(files):
         light, other = lights[k % len(lights)], lights[(k + 1) % len(lights)]
         target = load_reference(path, light, other, inputs=max(counts), size=size, seed=seed + k)
