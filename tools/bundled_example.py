@@ -81,14 +81,14 @@ def finish() -> tuple[Material, ...]:
     """Materials of the parts: body, lid, knob, arms, grip, spout, trim, board."""
     horizontal = np.diag([1.0, 1.0, 1.0])[[1, 0, 2]]
     enamel, cream = Coat(TEAL, 0.2), Coat(CREAM, 0.24)
-    chips = pt.Blotches(5.0 * np.eye(3), 11, 0.95, 0.04, octaves=5, gain=0.6)
+    chips = pt.blotches(5.0 * np.eye(3), 0.95, 0.04, octaves=5, gain=0.6, seed=11)
     body = Material(
         enamel,
         (
-            (cream, pt.Ramp((0.0, 1.0, 0.0), -0.012, -0.008, 0.0, 0)),
-            (enamel, pt.Bands(9.5 * horizontal, 0.16, 0.38, softness=0.02)),
-            (Coat((0.55, 0.06, 0.03), 0.25), pt.Dots(11.0 * np.eye(3), 0.22)),
-            (enamel, pt.Ramp((0.0, -1.0, 0.0), 0.03, 0.034, 0.0, 0)),
+            (cream, pt.ramp((0.0, 1.0, 0.0), -0.012, -0.008, 0.0, 0)),
+            (enamel, pt.bands(9.5 * horizontal, 0.16, 0.38, softness=0.02)),
+            (Coat((0.55, 0.06, 0.03), 0.25), pt.dots(11.0 * np.eye(3), 0.22)),
+            (enamel, pt.ramp((0.0, -1.0, 0.0), 0.03, 0.034, 0.0, 0)),
             (Coat(CHARCOAL, 0.75), chips),
         ),
         drift=0.03,
@@ -100,22 +100,22 @@ def finish() -> tuple[Material, ...]:
     fiber = np.diag([0.8, 60.0, 60.0])
     steel = Material(
         Coat(STEEL, 0.32, 1.0),
-        ((Coat((0.2, 0.08, 0.035), 0.9, 0.0), pt.Blotches(9.0 * np.eye(3), 3, 0.75, 0.15, octaves=5, gain=0.6)),),
-        (pt.Emboss(fiber, 2, 0.0006, octaves=1),),
+        ((Coat((0.2, 0.08, 0.035), 0.9, 0.0), pt.blotches(9.0 * np.eye(3), 0.75, 0.15, octaves=5, gain=0.6, seed=3)),),
+        (pt.emboss(fiber, 2, 0.0006, octaves=1),),
         drift_roughness=0.05,
         seed=7,
     )
     brass = Material(
         Coat(BRASS, 0.22, 1.0),
-        ((Coat((0.3, 0.2, 0.09), 0.5, 1.0), pt.Blotches(4.0 * np.eye(3), 9, 0.1, 0.6, octaves=4)),),
+        ((Coat((0.3, 0.2, 0.09), 0.5, 1.0), pt.blotches(4.0 * np.eye(3), 0.1, 0.6, octaves=4, seed=9)),),
         drift_roughness=0.06,
         seed=8,
     )
 
     def wood(light, dark, rough: float, seed: int) -> Material:
         axes = np.eye(3)[[1, 2, 0]]  # the fibers run along x
-        grain = pt.Grain(2.6 * axes, seed, 5.0, (1.7, 0.9))
-        bump = pt.Emboss(np.diag([30.0, 30.0, 1.2]) @ axes, seed + 1, 0.003, octaves=1)
+        grain = pt.grain(2.6 * axes, seed, 5.0, (1.7, 0.9))
+        bump = pt.emboss(np.diag([30.0, 30.0, 1.2]) @ axes, seed + 1, 0.003, octaves=1)
         return Material(
             Coat(light, rough), ((Coat(dark, min(rough + 0.1, 1.0)), grain),), (bump,), drift=0.1, seed=seed
         )

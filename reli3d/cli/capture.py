@@ -66,8 +66,7 @@ def main(argv: list[str] | None = None) -> int:
     finally:
         bar.close()
     lines = [*report.notes, *(f"left out {name}: {why}" for name, why in report.left_out.items())]
-    if report.lost:
-        lines.append(f"not registered: {', '.join(report.lost)}")
+    lines += [f"not registered: {', '.join(report.lost)}"] if report.lost else []
     for line in [*lines, summary(report), *(f"check failed: {text}" for text in report.failed)]:
         print(f"reli3d capture: {printable(line)}", file=sys.stderr)
     print(args.output)

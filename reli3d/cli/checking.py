@@ -45,13 +45,9 @@ class Check:
         draw_rig(views, target / "rig.png")
         if not self.silent:
             print(*views.notes, *lines, target / "rig.png", sep="\n")
-        self.found[name] = {
-            "suspect": lines[-1].startswith("suspect"),
-            "verdict": lines[-1],
-            "lines": lines[:-1],
-            "notes": list(views.notes),
-            "image": str(target / "rig.png"),
-        }
+        *lines, verdict = lines
+        found = {"suspect": verdict.startswith("suspect"), "verdict": verdict, "lines": lines}
+        self.found[name] = {**found, "notes": list(views.notes), "image": str(target / "rig.png")}
         return "done"
 
 

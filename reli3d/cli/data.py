@@ -7,9 +7,10 @@ import os
 import sys
 from pathlib import Path
 
+from tqdm import tqdm
+
 from reli3d.cli import objects
 from reli3d.cli.exit_codes import Parser, check_ranges, command, report
-from reli3d.cli.samples import SampleJob, SampleSpec
 from reli3d.errors import InputError
 
 COUNT, VIEWS = 1000, 6  # default numbers of seeds and views
@@ -91,33 +92,6 @@ def glb_files(paths: list[Path] | None) -> tuple[Path, ...]:
     return tuple(path.absolute() for path in found)
 
 
-def _sample_spec(args: argparse.Namespace) -> SampleSpec:
-    from reli3d.output.folder import check_folder
-    from reli3d.synthetic.maps import held_out, load_maps
-    from reli3d.synthetic.protocol import LIGHTS
-    from reli3d.synthetic.refinished import material_sets
-
-    check_ranges(args, first=(0, 10**9), count=(1, 10**9), views=(1, 64), size=(16, 2048), workers=(1, 1024))
-    paper = args.protocol == "paper"
-    if paper and args.views is not None:
-        raise InputError("--views", f"expected none with --protocol paper, got {args.views}; leave it out")
-    check_folder(args.output)
-    meshes, shapes = glb_files(args.meshes), glb_files(args.shapes)
-    fit = held_out(load_maps(args.maps)[1]).count(bool(args.held_out))
-    if not fit:
-        raise InputError("--maps", "expected at least six maps for --held-out, got fewer")
-    if paper and fit < LIGHTS:
-        raise InputError("--maps", f"expected at least {LIGHTS} for --protocol paper, got {fit} usable maps")
-    maps = args.maps.absolute()
-    if paper and args.views_only:
-        raise InputError("--views-only", "expected --protocol own, got paper")
-    if paper and args.materials:
-        raise InputError("--materials", "expected --protocol own, got paper")
-    views = args.views or VIEWS
-    sets = material_sets(args.materials) if args.materials else ()
-    return SampleSpec(maps, bool(args.held_out), paper, views, args.size, meshes, shapes, args.views_only, sets)
-
-
 @command("reli3d-data")
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
@@ -126,20 +100,39 @@ def main(argv: list[str] | None = None) -> int:
 
 def render(args: argparse.Namespace) -> int:
     """Writes the samples; returns 1 if some objects failed."""
-    spec = _sample_spec(args)
-    from tqdm import tqdm
+    from reli3d.output.folder import check_folder
 
+    check_ranges(args, first=(0, 10**9), count=(1, 10**9), views=(1, 64), size=(16, 2048), workers=(1, 1024))
+    paper = args.protocol == "paper"
+    if paper and args.views is not None:
+        raise InputError("--views", f"expected none with --protocol paper, got {args.views}; leave it out")
+    check_folder(args.output)
+    from reli3d.cli.samples import SampleJob, SampleSpec
+    from reli3d.synthetic.maps import held_out, load_maps
     from reli3d.synthetic.procedural import TEST_SEEDS, VALIDATION_SEEDS
     from reli3d.synthetic.protocol import LIGHTS
+    from reli3d.synthetic.refinished import material_sets
 
-    count = args.count or (len(spec.meshes) if spec.paper else 0) or COUNT
+    meshes, shapes = glb_files(args.meshes), glb_files(args.shapes)
+    fit = held_out(load_maps(args.maps)[1]).count(bool(args.held_out))
+    if not fit:
+        raise InputError("--maps", "expected at least six maps for --held-out, got fewer")
+    if paper and fit < LIGHTS:
+        raise InputError("--maps", f"expected at least {LIGHTS} for --protocol paper, got {fit} usable maps")
+    for option in ("views_only", "materials") if paper else ():
+        if getattr(args, option):
+            raise InputError(f"--{option.replace('_', '-')}", "expected --protocol own, got paper")
+    maps, views = args.maps.absolute(), args.views or VIEWS
+    sets = material_sets(args.materials) if args.materials else ()
+    spec = SampleSpec(maps, bool(args.held_out), paper, views, args.size, meshes, shapes, args.views_only, sets)
+    count = args.count or (len(meshes) if paper else 0) or COUNT
     seeds = range(args.first, args.first + count)
     if args.held_out:
         seeds = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}[args.held_out]
     elif seeds.stop > VALIDATION_SEEDS.start:
         raise InputError("--first", f"expected seeds below {VALIDATION_SEEDS.start}, got {seeds.stop - 1}")
     args.output.mkdir(parents=True, exist_ok=True)
-    ends = [f"_{k}" for k in range(LIGHTS)] if spec.paper else [""]
+    ends = [f"_{k}" for k in range(LIGHTS)] if paper else [""]
     names = [f"{seed:010d}{end}" for seed in seeds for end in ends]
     items = [objects.Item(Path(), n, args.output.absolute() / f"{n}.safetensors") for n in names]
     items = [item for item in items if not item.target.exists()]

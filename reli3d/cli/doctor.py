@@ -19,10 +19,7 @@ PROBLEM = "PROBLEM: "  # prefix of a value that makes the package unusable
 
 
 def examine() -> tuple[list[tuple[str, str]], bool]:
-    """Rows ``(name, value)``, and whether the package is usable, that is, no value begins with PROBLEM.
-
-    Compiles one kernel unless it is cached, which takes some seconds.
-    """
+    """Rows ``(name, value)``, and whether the package is usable: no value begins with PROBLEM.  Compiles a kernel."""
     rows = []
     for part in (_versions, _devices, _cache, _kernels, _files):
         try:
@@ -90,26 +87,23 @@ def _kernels() -> Iterator[tuple[str, str]]:
     from reli3d.geometry.triplane import sample_triplane
 
     for device in ["cpu"] + (["cuda"] if torch.cuda.is_available() else []):
+        options: dict = {"device": device, "dtype": torch.float32}
         start = time.perf_counter()
-        value = sample_triplane(
-            torch.ones(1, 3, 2, 4, 4, device=device, dtype=torch.float32),
-            torch.zeros(1, 5, 3, device=device, dtype=torch.float32),
-        )
+        value = sample_triplane(torch.ones(1, 3, 2, 4, 4, **options), torch.zeros(1, 5, 3, **options))
         seconds = time.perf_counter() - start
         right = bool((value == 1).all())
         yield f"kernels, {device}", f"run ({seconds:.1f} s)" if right else f"{PROBLEM}a triplane of ones is not 1"
 
 
 def _files() -> Iterator[tuple[str, str]]:
-    weights = ASSETS / "weights" / "small.safetensors"
+    weights, example = ASSETS / "weights" / "small.safetensors", ASSETS / "example"
+    missing = PROBLEM + "{} is missing: install the package again"
+    value = missing.format(weights)
     if weights.is_file():
-        digest = hashlib.sha256(weights.read_bytes()).hexdigest()
-        yield "weights, small", f"{weights}, {weights.stat().st_size / 2**20:.1f} MiB, sha256 {digest}"
-    else:
-        yield "weights, small", f"{PROBLEM}{weights} is missing: install the package again"
-    example = ASSETS / "example"
-    found = (example / "transforms.json").is_file()
-    yield "example", str(example) if found else f"{PROBLEM}{example} is missing: install the package again"
+        data = weights.read_bytes()
+        value = f"{weights}, {len(data) / 2**20:.1f} MiB, sha256 {hashlib.sha256(data).hexdigest()}"
+    yield "weights, small", value
+    yield "example", str(example) if (example / "transforms.json").is_file() else missing.format(example)
 
 
 @command("reli3d doctor")

@@ -2,10 +2,9 @@
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
-from reli3d.cli.exit_codes import Parser, command
+from reli3d.cli.exit_codes import Parser, command, report
 from reli3d.errors import InputError
 
 MAX_VIEWS = 16  # input views of the small network
@@ -59,10 +58,7 @@ def main(argv: list[str] | None = None) -> int:
         check_folder(args.json.parent)
     maps, names = load_maps(args.maps)
     mean = mean_environment(maps[[not h for h in held_out(names)]])
-    model = load_model(args.weights)
-    figures = table(
-        model, args.samples, mean, args.views, lambda line: print(line, file=sys.stderr), symmetry=args.symmetry
-    )
+    figures = table(load_model(args.weights), args.samples, mean, args.views, report, symmetry=args.symmetry)
     text = json.dumps(figures, indent=1)
     print(text)
     if args.json:

@@ -19,7 +19,6 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from reli3d.cli.help_format import Defaults
 from reli3d.errors import InputError, printable
 
 ENDING = {"SIGINT": "interrupted", "SIGTERM": "ended by SIGTERM", "SIGHUP": "ended by SIGHUP"}
@@ -32,6 +31,16 @@ class Stopped(BaseException):
     def __init__(self, number: int):
         super().__init__(number)
         self.number = number
+
+
+class Defaults(argparse.HelpFormatter):
+    """Appends the default of an option to its help unless the help mentions it."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        silent = action.default is None or action.default is False or not action.option_strings
+        if silent or action.default == argparse.SUPPRESS or "default" in (action.help or "default"):
+            return action.help
+        return f"{action.help} (default %(default)s)"
 
 
 class Parser(argparse.ArgumentParser):
@@ -98,7 +107,12 @@ def command(name: str) -> Callable:
                     except InputError as error:
                         code = _report(name, str(error), 2)
                     except Exception as error:
-                        code = _failed(name, error)
+                        args = _parsed.get()
+                        show_traceback(error, args)
+                        output = getattr(args, "file", None) or getattr(args, "output", None)
+                        log = write_log(output, error) if isinstance(output, Path) else None
+                        where = f"traceback in {printable(str(log))}" if log else "--traceback prints where"
+                        code = _report(name, f"{reason(error)}; {where}", 1)
                     ended.append(code)
                 except KeyboardInterrupt:
                     ended.append(_report(name, ENDING["SIGINT"], 128 + signal.SIGINT))
@@ -120,16 +134,6 @@ def reason(error: BaseException) -> str:
         return " ".join(printable(f"{' -> '.join(files)}: {error.strerror}" if files else error.strerror).split())
     text = " ".join(printable(line) for line in str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
-def _failed(name: str, error: Exception) -> int:
-    """Reports an unexpected exception in one line, writes its traceback, and returns the exit code."""
-    args = _parsed.get()
-    show_traceback(error, args)
-    output = getattr(args, "file", None) or getattr(args, "output", None)
-    log = write_log(output, error) if isinstance(output, Path) else None
-    where = f"; traceback in {printable(str(log))}" if log else "; --traceback prints where"
-    return _report(name, reason(error) + where, 1)
 
 
 def show_traceback(error: BaseException, args: argparse.Namespace | None) -> None:

@@ -53,20 +53,16 @@ def parser() -> argparse.ArgumentParser:
 
 @command("reli3d export")
 def main(argv: list[str] | None = None) -> int:
-    args = parser().parse_args(argv)
-    _check(args)
-    files, record = export(args)
-    print(json.dumps({"files": [str(f) for f in files], **record}) if args.json else "\n".join(map(str, files)))
-    return 0
-
-
-def _check(args: argparse.Namespace) -> None:
     from reli3d.output.folder import check_folder
 
+    args = parser().parse_args(argv)
     check_ranges(args, decimate=(16, 10**7), texture_size=(64, 4096))
     if args.textures != "png" and args.format != "glb":
         raise InputError("--textures", f"expected png with --format {args.format}, got {args.textures}")
     check_folder(args.output)
+    files, record = export(args)
+    print(json.dumps({"files": [str(f) for f in files], **record}) if args.json else "\n".join(map(str, files)))
+    return 0
 
 
 def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
@@ -83,7 +79,7 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
     origin: list[float] = []
     parts = read_glb(args.glb, notes=notes, origin=origin if args.format == "glb" else None)
     for note in notes:
-        print(f"reli3d-export: {note}", file=sys.stderr)
+        print(f"reli3d export: {note}", file=sys.stderr)
     if len(parts) != 1:
         raise InputError(args.glb, f"expected a GLB with one surface, got {len(parts)}")
     asset = parts[0]
@@ -92,9 +88,8 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
     if args.decimate is not None and len(asset.mesh.faces) > args.decimate:
         with extra("--decimate"):
             mesh = decimate(asset.mesh, args.decimate)
-        asset = transfer_textures(
-            replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)), asset, baked, shape=True
-        )
+        mesh = replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces))
+        asset = transfer_textures(mesh, asset, baked, shape=True)
     elif size != asset.textures.size or (args.format != "glb" and not portable(asset)):
         asset = transfer_textures(asset.mesh, asset, baked, shape=True)
     name = args.glb.stem

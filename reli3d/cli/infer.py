@@ -11,8 +11,7 @@ from pathlib import Path
 
 from reli3d.cli import objects
 from reli3d.cli.exit_codes import check_ranges, command, report, show_traceback
-from reli3d.cli.help_format import joined
-from reli3d.cli.options import AXES, parser
+from reli3d.cli.options import AXES, joined, parser
 from reli3d.errors import InputError, printable
 
 EXAMPLE = Path(__file__).parents[1] / "assets" / "example"

@@ -20,19 +20,9 @@ from reli3d.output.folder import claimed
 from reli3d.pipeline import FolderOptions, Progress, ReconstructOptions, reconstruct_folder
 
 STAGES = (
-    "reading",
-    "normalize",
-    "prepare",
-    "symmetry",
-    "network",
-    "surface",
-    "textures",
-    "light",
-    "frame",
-    "refine",
-    "preview",
-    "writing",
-)
+    "reading", "normalize", "prepare", "symmetry", "network", "surface", "textures", "light", "frame", "refine",
+    "preview", "writing",
+)  # fmt: skip
 
 
 class FolderJob:
@@ -48,15 +38,15 @@ class FolderJob:
         path = weights.locate(args.weights)
         trunk = args.precision if args.precision in (None, "auto") else getattr(torch, args.precision)
         self.model, manifest = weights.load(path, trunk=trunk, device=device)
-        self.weights = {
-            "file": Path(manifest.path).name,
-            "sha256": weights.known_sha256(path),
-            "license": manifest.license,
-        }
+        digest = weights.known_sha256(path)
+        self.weights = {"file": Path(manifest.path).name, "sha256": digest, "license": manifest.license}
         self.skip = args.skip_existing
         if budget:
             import reli3d.fit.refine  # noqa: F401 # its kernels are compiled with the others
-        compile_kernels(device)  # takes half a minute the first time, so after the weights are checked
+        modules = cache.imported(device)
+        if not cache.compiled(modules, device):  # half a minute the first time, so after the weights are checked
+            print("compiling kernels (first run only)", file=sys.stderr)
+            load_modules(modules, torch.device(device))
 
     def run(self, folder: Path, name: str, target: Path) -> str:
         """Reconstructs one object and writes its files; with --skip-existing only if they are missing."""
@@ -65,16 +55,8 @@ class FolderJob:
             if self.skip and results.complete(target, folder, refined=bool(self.reading.budget)):
                 return "skipped"
             with Bar(name) as bar:
-                reconstruct_folder(
-                    folder,
-                    name,
-                    replacing,
-                    self.model,
-                    self.weights,
-                    reading=self.reading,
-                    options=self.options,
-                    progress=bar,
-                )
+                made = folder, name, replacing, self.model, self.weights
+                reconstruct_folder(*made, reading=self.reading, options=self.options, progress=bar)
         return "done"
 
 
@@ -141,11 +123,3 @@ def catching_interrupt() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def compile_kernels(device: str) -> None:
-    """Compiles the kernel modules in parallel unless they are cached; reports it on stderr."""
-    modules = cache.imported(device)
-    if not cache.compiled(modules, device):
-        print("compiling kernels (first run only)", file=sys.stderr)
-        load_modules(modules, torch.device(device))

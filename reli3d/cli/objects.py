@@ -1,8 +1,4 @@
-"""Runs a job over many objects: in this process, in worker processes or on a Ray cluster.
-
-An object whose worker crashed is retried once, in worker processes while nothing else runs.  Workers are
-single-threaded; results are bitwise identical for any number of workers.
-"""
+"""Runs a job over many objects: here, in single-threaded workers, with bitwise identical results, or on Ray."""
 
 import contextlib
 import csv
@@ -65,13 +61,13 @@ class Row:
 
 
 Rows = Generator[Row, None, None]
+Submit = Callable[[Item], tuple[Future, object]]
 
 
 def make(job: Job, item: Item, failed: Callable[[Exception], None] = lambda error: None, *, writes: bool = True) -> Row:
     """Makes one object; an error is returned as a row, and its traceback is written to a log file next to the target.
 
-    failed: called with an error other than InputError.  writes: whether the job writes a result to the target, which
-    replaces the log of an earlier run and whose ``run_info.json`` is read.
+    failed: called with an error other than InputError.  writes: whether the job replaces the target with a result.
     """
     began = time.monotonic()
     try:
@@ -87,7 +83,11 @@ def make(job: Job, item: Item, failed: Callable[[Exception], None] = lambda erro
         return replace(row, seconds=seconds)
     with contextlib.suppress(OSError):
         log_of(item.target).unlink()  # of an earlier run
-    return replace(row, seconds=seconds, **_recorded(item.target))
+    recorded = {}
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # missing or broken
+        info = json.loads((item.target / "run_info.json").read_bytes())
+        recorded = {"mask_iou": info["mask_iou"], "faces": info["mesh"]["faces"], "notes": tuple(info["notes"])}
+    return replace(row, seconds=seconds, **recorded)
 
 
 def collect(
@@ -95,8 +95,7 @@ def collect(
 ) -> tuple[list[Row], int]:
     """Collects all rows; returns them and the exit code.
 
-    Objects that are not done are reported on stderr.  done: called with the row of each object that is done.  summary:
-    CSV file of the rows in the order of ``items``, also written by an interrupted command.
+    done: called with the row of each object that is done.  summary: CSV file of the rows in the order of ``items``.
     """
     ended: list[Row] = []
     try:
@@ -120,20 +119,8 @@ def collect(
     return ended, 0
 
 
-def _recorded(target: Path) -> dict:
-    """The fields of ``run_info.json`` that a summary contains; empty if it is missing or broken."""
-    try:
-        info = json.loads((target / "run_info.json").read_bytes())
-        return {"mask_iou": info["mask_iou"], "faces": info["mesh"]["faces"], "notes": tuple(info["notes"])}
-    except (OSError, ValueError, LookupError, TypeError):
-        return {}
-
-
 def items_of(paths: Sequence[Path], output: Path) -> list[Item]:
-    """The folders among ``paths`` and those named in list files among them, with targets in ``output``.
-
-    A target has the name of its folder, with a number appended to duplicates.  Raises InputError.
-    """
+    """The folders among ``paths`` and in their list files, with unique targets in ``output``.  Raises InputError."""
     folders: list[Path] = []
     for path in paths:
         is_list = path.is_file() and path.suffix.lower() not in (*VIDEOS, *PHOTOGRAPHS)
@@ -233,12 +220,7 @@ def _on_ray(ray, start: Callable[[], Job], items: Sequence[Item], gpu: bool) -> 
 
 
 def _rows(
-    submit: Callable[[Item], tuple[Future, object]],
-    items: Sequence[Item],
-    limit: Callable[[], int],
-    crash: type[Exception],
-    *,
-    alone: bool,
+    submit: Submit, items: Sequence[Item], limit: Callable[[], int], crash: type[Exception], *, alone: bool
 ) -> Rows:
     """Keeps ``limit()`` objects submitted; one that raises ``crash`` is retried.
 

@@ -1,11 +1,22 @@
 """The options of ``reli3d-infer``, and those in common with ``reli3d check``."""
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from reli3d.cli.exit_codes import Parser
 
 AXES = ("x", "y", "z", "-x", "-y", "-z")
+
+
+def joined(argv: Sequence[str] | None, option: str, values: Sequence[str]) -> list[str]:
+    """The arguments with ``option value`` joined by ``=`` for ``values``, which may begin with a dash."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    for k in range(len(words) - 2, -1, -1):
+        if words[k] == option and words[k + 1] in values:
+            words[k : k + 2] = [f"{option}={words[k + 1]}"]
+    return words
 
 
 def parser() -> argparse.ArgumentParser:

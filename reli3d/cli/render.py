@@ -1,6 +1,7 @@
 """``reli3d-render``: still images and turntables of a GLB under an environment map."""
 
 import argparse
+import io
 import json
 import math
 import sys
@@ -109,7 +110,6 @@ def parser() -> argparse.ArgumentParser:
 @command("reli3d-render")
 def main(argv: list[str] | None = None) -> int:
     args = _completed(parser().parse_args(argv))
-    _check(args)
     files = [str(path) for path in render_files(args)]
     record = {name: getattr(args, name) for name in ("frames", "size", "samples", "supersampling")}
     print(json.dumps({"files": files, **record}) if args.json else "\n".join(files))
@@ -117,7 +117,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _completed(args: argparse.Namespace) -> argparse.Namespace:
-    """The arguments with defaults that depend on others; ``args.file``: the file named by ``--output``, or None."""
+    """The arguments, checked, with defaults that depend on others; ``args.file``: the file of ``--output``, or None."""
+    from reli3d.cli.infer import choose_device
+    from reli3d.output.folder import check_folder
+
     ending = args.output.suffix.lower().removeprefix(".")
     args.file = args.output if ending in FORMATS and not args.output.is_dir() else None
     if args.file is not None:
@@ -132,13 +135,6 @@ def _completed(args: argparse.Namespace) -> argparse.Namespace:
     samples, supersampling = QUALITIES[args.quality]
     args.samples = tuple(args.samples or samples)
     args.supersampling = args.supersampling if args.supersampling is not None else supersampling
-    return args
-
-
-def _check(args: argparse.Namespace) -> None:
-    from reli3d.cli.infer import choose_device
-    from reli3d.output.folder import check_folder
-
     check_ranges(args, frames=(1, 3600), size=(1, 8192), supersampling=(1, 16), plan=(1, 65536), seed=(0, 10**9))
     check_ranges(args, fov=(1, 150), elevation=(-89, 89), azimuth=(-3600, 3600), exposure=(-32, 32))
     if not all(0 <= k <= 65536 for k in args.samples) or sum(args.samples) == 0:
@@ -157,6 +153,7 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError("--distance", f"expected a positive length, got {args.distance}")
     choose_device(args.device)
     check_folder(args.output)
+    return args
 
 
 def render_files(args: argparse.Namespace) -> list[Path]:
@@ -165,6 +162,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     from tqdm import tqdm
 
     from reli3d.geometry.camera import Camera, look_at
+    from reli3d.io.files import write_bytes
     from reli3d.io.glb import read_glb
     from reli3d.io.hdr import read_environment, write_exr
     from reli3d.render.environment import Environment
@@ -196,10 +194,9 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         eye = center + distance * torch.tensor(offset, device=device)
         camera = Camera.from_fov(look_at(eye, center, up), math.radians(args.fov), args.size, args.size)
         if args.plan is not None and frame == 0:
-            relative = args.format != "exr"
-            counts: Any = {"total": args.plan, "relative": relative, "options": options}
+            given: Any = {"total": args.plan, "relative": args.format != "exr", "options": options, **shown}
             try:
-                plan = plan_render(parts, camera, environment, **counts, **shown)
+                plan = plan_render(parts, camera, environment, **given)
             except ValueError as error:  # no ray hits the object
                 raise InputError("--plan", f"{error}; bring the camera nearer") from None
             args.samples = plan.samples
@@ -218,14 +215,14 @@ def render_files(args: argparse.Namespace) -> list[Path]:
             if args.format == "exr":
                 write_exr(written[-1], (image.radiance * 2.0**args.exposure).cpu())
             else:
-                _save(written[-1], _display_image(image, args), format="PNG")
+                write_bytes(written[-1], _encoded([_display_image(image, args)], "png"))
         if args.aovs:
             written += _write_aovs(stem, image)
         bar.update(1)
     bar.close()
     if animation:
         written.append(args.file or args.output / f"{args.glb.stem}.{args.format}")
-        _animate(written[-1], animation, args.format)
+        write_bytes(written[-1], _encoded(animation, args.format))
     return written
 
 
@@ -241,27 +238,20 @@ def _display_image(image, args):
     return Image.fromarray((shown * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
 
 
-def _animate(path: Path, images: list, kind: str) -> None:
-    """Writes a looping animation of ``images`` at RATE frames per second."""
+def _encoded(images: list, kind: str) -> bytes:
+    """A file of one image, or a looping animation of ``images`` at RATE frames per second."""
     if kind == "mp4":
-        from reli3d.io.files import write_bytes
         from reli3d.output.video import mp4_bytes
 
-        return write_bytes(path, mp4_bytes(images, RATE))
-    # disposal 2: clear to transparent before each frame
-    options: Any = {"lossless": False} if kind == "webp" else {"disposal": 2}
-    options |= {"save_all": True, "append_images": images[1:], "duration": round(1000 / RATE), "loop": 0}
-    return _save(path, images[0], format=kind.upper(), **options)
-
-
-def _save(path: Path, image_file, **options) -> None:
-    from io import BytesIO
-
-    from reli3d.io.files import write_bytes
-
-    data = BytesIO()
-    image_file.save(data, **options)
-    write_bytes(path, data.getvalue())
+        return mp4_bytes(images, RATE)
+    options: Any = {}
+    if kind != "png":
+        options = {"save_all": True, "append_images": images[1:], "duration": round(1000 / RATE), "loop": 0}
+        # disposal 2: clear to transparent before each frame
+        options |= {"lossless": False} if kind == "webp" else {"disposal": 2}
+    data = io.BytesIO()
+    images[0].save(data, format=kind.upper(), **options)
+    return data.getvalue()
 
 
 def _write_aovs(stem: Path, image) -> list[Path]:

@@ -2,13 +2,22 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import numpy as np
-    from torch import Tensor
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import save_file
+from torch import Tensor
 
-    from reli3d.synthetic.samples import Surface
+from reli3d.io.files import replacing
+from reli3d.io.gltf_parts import has_material_maps
+from reli3d.synthetic.maps import held_out, load_maps, with_lamps
+from reli3d.synthetic.procedural import make_object
+from reli3d.synthetic.protocol import protocol_sample
+from reli3d.synthetic.refinished import RefinishedSurface
+from reli3d.synthetic.samples import ObjectSurface, Surface, synthesize
+from reli3d.synthetic.scanned import ScannedSurface
+from reli3d.synthetic.shapes import ShapeSurface
 
 LAMP_PROBABILITY = 0.45  # of lamps added to a training environment
 
@@ -30,29 +39,17 @@ class SampleSpec:
 
 class SampleJob:
     def __init__(self, spec: SampleSpec):
-        import torch
-
-        from reli3d.synthetic.maps import held_out, load_maps
-
         torch.set_num_threads(1)
         maps, names = load_maps(spec.maps)
         self.spec = spec
         self.lights = [m for m, h in zip(maps, held_out(names), strict=True) if h == spec.held_out]
 
     def run(self, folder: object, name: str, target: Path) -> str:
-        """Writes the sample ``name``: the seed, with the paper's protocol followed by the index of the environment.
-
-        Raises InputError for a mesh that cannot be used.
-        """
-        from safetensors import SafetensorError
-        from safetensors.torch import save_file
-
-        from reli3d.io.files import replacing
-
+        """Writes the sample ``name``: the seed, in the paper's protocol with the index of the environment."""
         if target.exists():  # written by a worker that crashed later
             return "skipped"
-        seed, _, light = name.partition("_")
-        sample = self._paper(int(seed), int(light)) if self.spec.paper else self._own(int(seed))
+        seed, _, place = name.partition("_")
+        sample = self._sample(int(seed), int(place) if place else None)
         try:
             with replacing(target) as temporary:
                 save_file(sample, temporary)
@@ -60,14 +57,8 @@ class SampleJob:
             raise OSError(f"{target}: cannot be written ({error})") from None
         return "done"
 
-    def _surface(self, seed: int, rng: "np.random.Generator") -> "Surface":
+    def _surface(self, seed: int, rng: np.random.Generator) -> Surface:
         """The object of a seed.  rng: stretches and tints meshes, except with the paper's protocol."""
-        from reli3d.synthetic.procedural import make_object
-        from reli3d.synthetic.refinished import RefinishedSurface
-        from reli3d.synthetic.samples import ObjectSurface
-        from reli3d.synthetic.scanned import ScannedSurface
-        from reli3d.synthetic.shapes import ShapeSurface
-
         if self.spec.shapes:
             surface: Surface = ShapeSurface(self.spec.shapes, rng)
         elif self.spec.meshes:
@@ -81,34 +72,21 @@ class SampleJob:
 
     def _measured(self, seed: int) -> bool:
         """Whether roughness and metallic values of the object are ground truth and not placeholders of a scan."""
-        from reli3d.io.gltf_parts import has_material_maps
-
         return not self.spec.meshes or bool(self.spec.shapes) or has_material_maps(self._mesh(seed))
 
     def _mesh(self, seed: int) -> Path:
         return self.spec.meshes[seed % len(self.spec.meshes)]
 
-    def _own(self, seed: int) -> "dict[str, Tensor]":
-        import numpy as np
-
-        from reli3d.synthetic.maps import with_lamps
-        from reli3d.synthetic.samples import synthesize
-
-        rng = np.random.default_rng((seed, 1))
+    def _sample(self, seed: int, place: int | None) -> dict[str, Tensor]:
+        """place: index of the environment in the paper's protocol, None without it."""
+        spec, rng = self.spec, np.random.default_rng((seed, 1))
         surface = self._surface(seed, rng)
+        if place is not None:
+            return protocol_sample(surface, self.lights, seed, place, pbr=self._measured(seed), size=spec.size)
         light = self.lights[int(rng.integers(len(self.lights)))]
-        if not self.spec.held_out and rng.random() < LAMP_PROBABILITY:
+        if not spec.held_out and rng.random() < LAMP_PROBABILITY:
             light = with_lamps(light, rng)
-        spec = self.spec
         known = bool(spec.materials) or self._measured(seed)
         return synthesize(
             surface, light, rng, size=spec.size, views=spec.views, views_only=spec.views_only, finish_known=known
         )
-
-    def _paper(self, seed: int, light: int) -> "dict[str, Tensor]":
-        import numpy as np
-
-        from reli3d.synthetic.protocol import protocol_sample
-
-        surface = self._surface(seed, np.random.default_rng((seed, 1)))
-        return protocol_sample(surface, self.lights, seed, light, pbr=self._measured(seed), size=self.spec.size)

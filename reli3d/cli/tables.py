@@ -43,10 +43,8 @@ def main(argv: list[str] | None = None) -> int:
     lights = [Environment(m) for m, held in zip(maps, held_out(names), strict=True) if held]
     if len(lights) < 2:
         raise InputError("--maps", "expected at least two held-out maps, got fewer; give twelve maps or more")
-    model = load_model(args.weights)
-    tables, rows, sheet = table(
-        model, args.objects, lights, args.views, size=args.size, seed=args.seed, progress=report
-    )
+    given = load_model(args.weights), args.objects, lights, args.views
+    tables, rows, sheet = table(*given, size=args.size, seed=args.seed, progress=report)
     args.output.mkdir(parents=True, exist_ok=True)
     text = markdown(tables)
     write_bytes(args.output / "table.md", text.encode())

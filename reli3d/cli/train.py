@@ -130,12 +130,12 @@ def small_stage(args: argparse.Namespace) -> "Stage":
 
     pixels = args.stage == "pixels"
     calibrated = CALIBRATED_VIEWS + 1  # views of a sample for calibration: one is compared
-    if pixels and "export" in args:
-        raise InputError("--export", "expected stage small, got pixels; train --stage small from it first")
     exporting = "export" in args
-    if not args.data and not (exporting and "validation" in args):
-        raise InputError("data", "expected folders of samples, got none; make them with reli3d-data")
+    if pixels and exporting:
+        raise InputError("--export", "expected stage small, got pixels; train --stage small from it first")
     if not (exporting and "validation" in args):
+        if not args.data:
+            raise InputError("data", "expected folders of samples, got none; make them with reli3d-data")
         for folder in args.data:
             check_samples(folder, "data", views=calibrated if exporting else 1, points=not pixels)
     if "validation" in args:
@@ -159,17 +159,18 @@ def small_network(start: str | None, resumed: Path) -> "LocalReconstructor":
     """
     from reli3d.nn import weights
     from reli3d.nn.local import LocalReconstructor
+    from reli3d.nn.presets import SMALL, LocalPreset, from_json
     from reli3d.train import checkpoint
-    from reli3d.train.pixels import load_levels, missing_parameters
+    from reli3d.train.pixels import missing_parameters
 
     if start is None or start.endswith(".pt"):
         known = Path(start) if start else resumed
         state = checkpoint.load(known) if known.exists() or start else {}
-        model = LocalReconstructor(checkpoint.small_preset(state))
+        preset = from_json(state["preset"]) if "preset" in state else SMALL
+        model = LocalReconstructor(preset if isinstance(preset, LocalPreset) else SMALL)
         if start:
-            average = state["average"]
-            checkpoint.check_shapes(Path(start), average, model, missing_parameters(model.preset, average))
-            load_levels(model, average)
+            missing = missing_parameters(model.preset, state["average"])
+            checkpoint.load_average(known, model, state, missing)
         return model.train()
     found = weights.load_model(start, "cpu")
     if not isinstance(found, LocalReconstructor):
@@ -232,34 +233,26 @@ def start_from(start: str, model: "Reconstructor") -> None:
     from reli3d.train import checkpoint
 
     if start.endswith(".pt"):
-        average = checkpoint.load(Path(start))["average"]
-        checkpoint.check_shapes(Path(start), average, model)
-    else:
-        found = weights.load_model(start, "cpu")
-        if found.preset != model.preset:
-            raise InputError("--weights", f"expected preset {model.preset.name}, got {found.preset.name}")
-        average = found.state_dict()
-    model.load_state_dict(average)
+        checkpoint.load_average(Path(start), model)
+        return
+    found = weights.load_model(start, "cpu")
+    if found.preset != model.preset:
+        raise InputError("--weights", f"expected preset {model.preset.name}, got {found.preset.name}")
+    model.load_state_dict(found.state_dict())
 
 
 def export(args: argparse.Namespace, stage: "Stage") -> "LocalReconstructor | Reconstructor":
-    """The network with the averaged weights of the checkpoint, the small network calibrated.
-
-    Raises InputError if it predicts no surface.
-    """
+    """The network with the averaged weights of the checkpoint, calibrated if it is the small one; or InputError."""
     from reli3d.nn.local import LocalReconstructor
     from reli3d.train import checkpoint
     from reli3d.train.calibrate import calibrate
+    from reli3d.train.stages.stage import no_surface
 
     model: Any = stage.model.cpu()
     path = args.output / "state.pt"
-    state = checkpoint.load(path)
-    checkpoint.check_shapes(path, state["average"], model)
-    model.load_state_dict(state["average"])
+    state = checkpoint.load_average(path, model)
     model.eval()
     if state["measures"].get("surface", 1.0) == 0.0:
-        from reli3d.train.stages.stage import no_surface
-
         raise no_surface(path)
     if isinstance(model, LocalReconstructor):
         samples = args.validation if "validation" in args else args.data[0]

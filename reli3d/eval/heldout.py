@@ -1,8 +1,4 @@
-"""Metrics on held-out procedural objects under held-out environments.
-
-For every sample: silhouette IoU and base color PSNR in held-out views, with the PSNR of the best constant color as a
-baseline; and the error of the environment, with that of the mean training environment as a baseline.
-"""
+"""Metrics on held-out procedural objects: silhouettes, base color in held-out views and lighting, with baselines."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -35,10 +31,7 @@ BLACK = 0.01  # added to radiance before the logarithm
 def seen_colors(
     scene: RayScene, camera: Camera, points_at: Callable[[Tensor, Tensor], SurfacePoints]
 ) -> tuple[Tensor, Tensor]:
-    """Coverage ``(H, W)`` bool and base color ``(H, W, 3)``, sRGB-encoded.
-
-    points_at: surface points at faces and barycentric coordinates.
-    """
+    """Coverage ``(H, W)`` bool and base color ``(H, W, 3)``, sRGB, of the surface points that ``points_at`` gives."""
     hits, _, _ = primary_hits(scene, camera)
     seen = hits.face >= 0
     color = torch.zeros(*seen.shape, 3, dtype=torch.float32, device="cpu")
@@ -80,14 +73,14 @@ def evaluate(
     last = len(sample["c2w"])
     if not 1 <= count <= last - HELD_OUT_VIEWS:
         raise ValueError(f"count: expected 1 to {last - HELD_OUT_VIEWS} of {last} views, got {count}")
+    options = ReconstructOptions(texture_size=512, symmetry=symmetry)
     try:
-        options = ReconstructOptions(texture_size=512, symmetry=symmetry)
         asset = reconstruct(stored_views(sample, count), weights=model, options=options)
     except NoSurface:
         return {"empty": 1.0, "iou": 0.0}
     scene, size = RayScene(asset.mesh.vertices, asset.mesh.faces), sample["images"].shape[1]
     original = ObjectSurface(make_object(seed))
-    ious, result_all, reference_all = [], [], []
+    ious, pairs = [], []
     for i in range(last - HELD_OUT_VIEWS, last):
         camera = Camera(sample["c2w"][i], sample["intrinsics"][i], size, size)
         mask, reference = seen_colors(original.scene, camera, lambda face, bary: original.points_at(face.long(), bary))
@@ -96,9 +89,8 @@ def evaluate(
         result_mask, result = seen_colors(scene, camera, partial(surface_points, asset.mesh, asset.textures))
         both = mask & result_mask
         ious.append(float(both.sum() / (mask | result_mask).sum().clamp(min=1)))
-        result_all.append(result[both])
-        reference_all.append(reference[both])
-    result, reference = torch.cat(result_all), torch.cat(reference_all)
+        pairs.append((result[both], reference[both]))
+    result, reference = map(torch.cat, zip(*pairs, strict=True))
     target = quarter_turn(sample["environment"].float(), -1)  # stored with -Z at the horizontal center
     predicted = asset.light.resized(len(target)).radiance
     exposure = target.mean() / mean_light.mean()
@@ -121,8 +113,7 @@ def evaluate(
 def summary(rows: list[dict[str, float]]) -> dict[str, float]:
     """Means over the objects that have the metric.
 
-    A mean squared error gives two PSNRs [dB]: ``_psnr``, the mean over objects, which nearly uniform objects dominate;
-    and ``_psnr_pooled``, that of the mean error, which colorful objects dominate.
+    A mean squared error gives ``_psnr`` [dB], the mean over objects, and ``_psnr_pooled``, that of the mean error.
     """
     out: dict[str, float] = {"objects": len(rows)}
     for key in dict.fromkeys(key for row in rows for key in row):
@@ -152,10 +143,7 @@ def table(
     *,
     symmetry: str = "auto",
 ) -> dict[int, dict]:
-    """:func:`summary` of the samples in ``folder`` for each number of input views.
-
-    progress: called with one line per object.  Raises InputError if the folder has no samples.
-    """
+    """:func:`summary` of the samples in ``folder`` for each number of views.  progress: called for each object."""
     files = sorted(folder.glob("*.safetensors"))
     if not files:
         raise InputError(folder, "expected *.safetensors files, got none; make samples with reli3d-data render")

@@ -1,8 +1,4 @@
-"""The metrics of the ReLi3D paper with their definitions.
-
-Geometry is compared in the frame of the reference, scaled so that its longest side is 2.  Images are compared as
-display values (sRGB in [0, 1]) over black, including the background.
-"""
+"""The metrics of the ReLi3D paper: geometry in the frame of the reference, images as sRGB in [0, 1] over black."""
 
 from functools import partial
 
@@ -35,9 +31,8 @@ def surface_samples(mesh: Mesh, count: int = SURFACE_SAMPLES, seed: int = 0) -> 
 def geometry(result: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Chamfer distance and F-scores of points ``(N, 3)`` of a result and of the reference.
 
-    cd: mean of the two mean distances (not squared) to the nearest point of the other set.  fs@t: harmonic mean of
-    precision and recall, the fractions of points within t of the other set.  Lengths are in units of half the longest
-    side of the reference.
+    cd: mean of the two mean distances (not squared) to the nearest point of the other set.  fs@t: harmonic mean of the
+    fractions of points within t of the other set.  Lengths are in units of half the reference's longest side.
     """
     half = float(np.ptp(reference, axis=0).max()) / 2.0
     result, reference = result / half, reference / half
@@ -55,10 +50,7 @@ def psnr(result: Tensor, reference: Tensor) -> float:
 
 
 def ssim(result: Tensor, reference: Tensor) -> float:
-    """Structural similarity of ``(H, W, C)`` in [0, 1], mean over channels and over windows inside the image.
-
-    Wang et al. 2004: Gaussian window of 11 pixels, K1 = 0.01, K2 = 0.03.  Raises ValueError below 11 pixels per side.
-    """
+    """Structural similarity (Wang et al. 2004) of ``(H, W, C)`` in [0, 1], mean over channels and windows inside."""
     if min(result.shape[:2]) < WINDOW:
         raise ValueError(f"result: expected at least {WINDOW} pixels per side, got {tuple(result.shape)}")
     at = torch.arange(WINDOW, dtype=torch.float64, device="cpu") - WINDOW // 2

@@ -1,6 +1,4 @@
-"""The tables of the ReLi3D paper for textured GLB files.
-
-Each object is rendered, reconstructed and compared with the original.
+"""The tables of the ReLi3D paper for textured GLB files, which are rendered, reconstructed and compared.
 
 An object is centered and scaled to a longest side of 1.  The input views are lit by one environment.  Held-out views
 compare renderings under the input lighting, relighting by another environment, and the material maps.
@@ -60,10 +58,10 @@ def load_reference(
     points = torch.cat([p.mesh.vertices for p in parts])
     low, high = points.amin(0), points.amax(0)
     scale = 1.0 / float((high - low).max())
-    vertices = [((p.mesh.vertices - (low + high) / 2) * scale).contiguous() for p in parts]
-    moved = [replace(p, mesh=replace(p.mesh, vertices=v)) for p, v in zip(parts, vertices, strict=True)]
+    move = lambda mesh: replace(mesh, vertices=((mesh.vertices - (low + high) / 2) * scale).contiguous())  # noqa: E731
+    moved = [replace(part, mesh=move(part.mesh)) for part in parts]
     drawn = sample_cameras(np.random.default_rng((seed, 5)), inputs + HELD_OUT_VIEWS)
-    poses = [(torch.as_tensor(c2w, device="cpu"), float(fov)) for c2w, fov in zip(*drawn, strict=True)]
+    poses = zip(torch.as_tensor(drawn[0], device="cpu"), drawn[1].tolist(), strict=True)
     cameras = [Camera.from_fov(c2w, fov, size, size) for c2w, fov in poses]
     return ReferenceObject(path.stem, moved, light, other, cameras)
 
@@ -112,11 +110,7 @@ def input_views(target: ReferenceObject, count: int, hero: int, exposure: float)
 def evaluate(
     model: Network, target: ReferenceObject, count: int, *, seed: int = 0
 ) -> tuple[dict[str, float], list[Tensor]]:
-    """Metrics of one object reconstructed from ``count`` views, and a row of images for :func:`sheet`.
-
-    The reference view is random.  ``empty``: 1 if the network predicts no surface; the images are then black and the
-    geometry metrics absent.
-    """
+    """Metrics of one object from ``count`` views, ``empty`` 1 without a surface, and a row for :func:`sheet`."""
     exposures = exposure_of(target, target.light), exposure_of(target, target.other)
     front = int(np.random.default_rng((seed, count)).integers(count))
     views = input_views(target, count, front, exposures[0])
@@ -184,11 +178,9 @@ def table(
 ) -> tuple[dict, list[dict], Tensor]:
     """Means for each number of views, the metrics of every object, and the image sheet of the last number of views.
 
-    lights: assigned to the objects in turn; the next one is used for relighting.  size: pixels per side of the views.
-    seed: of the first object; the next has the next seed.
+    lights: assigned to the objects in turn; the next one relights.  size: pixels per side.  seed: of the first object.
     """
-    rows: list[dict] = []
-    rows_of_images = []
+    rows, rows_of_images = list[dict](), []
     for k, path in enumerate(files):
         light, other = lights[k % len(lights)], lights[(k + 1) % len(lights)]
         target = load_reference(path, light, other, inputs=max(counts), size=size, seed=seed + k)

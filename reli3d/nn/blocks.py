@@ -22,10 +22,7 @@ def linear_of(layers: nn.Module, index: int) -> nn.Linear:
 
 
 def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:
-    """``evaluate(*inputs)`` without gradient; on a CPU in blocks of ROWS rows of the inputs.
-
-    Blocks run on the bridge's thread pool, so ``evaluate`` must treat rows independently and be thread-safe.
-    """
+    """``evaluate(*inputs)`` without gradient; on a CPU in parallel blocks of rows, which must be independent."""
     n = len(inputs[0])
     if inputs[0].is_cuda or n == 0:
         with torch.no_grad():
@@ -35,11 +32,7 @@ def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict
 
 
 def submit(work: Callable[[], T], device: torch.device) -> Callable[[], T]:
-    """Submits ``work()`` to the bridge's thread pool, without gradient; returns a function that waits for the value.
-
-    Runs ``work`` immediately on CUDA and when only one thread is used.  Exceptions are raised by the returned function,
-    or immediately in these cases.
-    """
+    """Submits ``work()`` to the thread pool, without gradient; returns a function that waits.  On CUDA runs it now."""
     work = torch.no_grad()(work)
     if serial() or device.type == "cuda":
         value = work()

@@ -1,7 +1,6 @@
 """Depth of pixels by comparing the views at hypotheses along each pixel's ray, around the depth predicted per view.
 
-Sources: Yao et al. 2018, MVSNet, arXiv 1804.02505 (cost volume, regularized by 3D convolutions, expected depth); Guo et
-al. 2019, arXiv 1903.04025 (correlation of features in groups).
+Sources: Yao et al. 2018, MVSNet, arXiv 1804.02505 (cost volume); Guo et al. 2019, arXiv 1903.04025 (groups).
 """
 
 import torch
@@ -59,12 +58,10 @@ class CostVolume(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Depth ``(V, Q, Q)`` relative to the world origin's, of ``V`` > 1 views, and its standard deviation.
 
-        Where nothing is covered they are ``depth`` and 0.
-
         features: ``(V, Q, Q, F)``.  color: ``(V, Q, Q, 3)`` sRGB.  depth, normal: ``(V, Q, Q)`` and ``(V, Q, Q, 3)``,
-        predicted per view.  span: ``(V, Q, Q, 2)`` from :func:`~reli3d.nn.pyramid.pixel_hull_depths`.  camera: of
-        ``Q`` by ``Q`` pixels.  coverage: ``(V, Q, Q)``.  Gradients reach features, color, depth, normal and
-        every parameter but the last bias, which has no effect, and ``widening``, which is read elsewhere.
+        predicted per view; returned where nothing is covered, with 0.  span: ``(V, Q, Q, 2)`` from
+        :func:`~reli3d.nn.pyramid.pixel_hull_depths`.  camera: of ``Q`` by ``Q`` pixels.  coverage: ``(V, Q, Q)``.
+        Gradients reach all maps but ``span`` and every parameter but the last bias and ``widening``.
         """
         match = self.match(torch.cat([features, color], -1).permute(0, 3, 1, 2)).unflatten(1, (GROUPS, -1))
         match = functional.normalize(match, dim=2).flatten(1, 2).permute(0, 2, 3, 1)

@@ -1,8 +1,4 @@
-"""Neural field of one object: signed field values in its volume, material on its surface, and its lighting.
-
-:class:`TriplaneField` is decoded from the triplane of the published network, :class:`reli3d.nn.local.LocalField` from
-the volume and the pixel maps of the convolutional one.
-"""
+"""Neural field of one object from a triplane: signed field values, material on its surface, and its lighting."""
 
 from dataclasses import dataclass
 
@@ -36,10 +32,7 @@ class TriplaneField:
 
     @torch.no_grad()
     def cube_weights(self, points: Tensor, sdf: Tensor) -> CubeWeights:
-        """Deformation and weights for ``extract_surface``, evaluated only at the surface cubes.
-
-        points: ``(N, 3)``, the grid points in the order of ``sdf``.
-        """
+        """Deformation and weights at the surface cubes of ``sdf``, whose grid points are ``points (N, 3)``."""
         model, cubes = self.model, surface_cubes(sdf)
         at, rows = surface_points(sdf, cubes)
         raw = [model.query(self.code, points[part][None], ("deformation", "flexicubes")) for part in at.split(CHUNK)]

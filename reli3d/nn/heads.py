@@ -1,7 +1,4 @@
-"""Decoder heads of the triplane: independent MLPs on point features, and the merging of FlexiCubes weights.
-
-Sizes are the published ones; :mod:`reli3d.nn.published` maps the published names to these.
-"""
+"""Decoder heads of the triplane: independent MLPs on point features, and the merging of FlexiCubes weights."""
 
 from collections.abc import Sequence
 
@@ -67,13 +64,9 @@ class Heads(nn.ModuleDict):
         super().__init__({name: mlp(features, width, *sizes) for name, sizes in HEADS.items()})
 
     def forward(self, features: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
-        """``{name: (..., outputs)}`` of features ``(..., features)``; values as :func:`activate` describes them.
-
-        Raises ValueError for an unknown name.
-        """
-        for name in names:
-            if name not in self:
-                raise ValueError(f"heads: expected some of {', '.join(self)}, got {name}")
+        """``{name: (..., outputs)}`` of features ``(..., features)``, see :func:`activate`.  Raises ValueError."""
+        if unknown := [name for name in names if name not in self]:
+            raise ValueError(f"heads: expected some of {', '.join(self)}, got {unknown[0]}")
         return {name: activate(name, self[name](features)) for name in names}
 
 
@@ -102,17 +95,11 @@ class WeightMerger(nn.Module):
         self.mlp = mlp(8 * HEADS["flexicubes"][0], width, sum(MERGED), 2)
 
     def merged(self, corners: Tensor) -> Tensor:
-        """Raw weights ``(..., 21)`` of cubes from their corners ``(..., 8, 16)``.
-
-        Corner k is at x = k & 1, y = k >> 1 & 1, z = k >> 2 of the cube.
-        """
+        """Raw weights ``(..., 21)`` of corners ``(..., 8, 16)``; k is at x = k & 1, y = k >> 1 & 1, z = k >> 2."""
         return MERGED_MULTIPLIER * self.mlp(corners.flatten(-2))
 
     def forward(self, corners: Tensor) -> CubeWeights:
-        """Weights of cubes whose corners have the ``flexicubes`` head's values ``(..., 8, 16)``.
-
-        alpha and beta are in (0.5, 1.5), gamma in (0.25, 0.75).
-        """
+        """Weights of cubes from ``flexicubes (..., 8, 16)``: alpha, beta in (0.5, 1.5), gamma in (0.25, 0.75)."""
         beta, alpha, gamma = self.merged(corners).split(MERGED, dim=-1)
         return CubeWeights(
             alpha=1.0 + WEIGHT_SCALE * alpha.tanh(),
@@ -122,6 +109,5 @@ class WeightMerger(nn.Module):
 
 
 def deformation(raw: Tensor, resolution: int) -> Tensor:
-    """Displacement of grid vertices from raw head outputs: less than half a cell of a unit cube of ``resolution``
-    cells a side."""
+    """Displacement of grid vertices from raw outputs: less than half a cell, of ``resolution`` in a unit cube."""
     return raw.tanh() * (DEFORMATION_LIMIT / (2 * resolution))

@@ -1,7 +1,6 @@
 """The published checkpoint from the Hugging Face hub: fetched on request only, then converted.
 
-``huggingface_hub`` (the extra ``hub``) resumes the transfer and sends the user's token.  Its settings apply:
-``HF_ENDPOINT``, ``HF_TOKEN``, ``HF_HUB_OFFLINE`` and the proxies of the environment.
+``huggingface_hub`` (extra ``hub``) obeys ``HF_ENDPOINT``, ``HF_TOKEN``, ``HF_HUB_OFFLINE`` and the proxies.
 """
 
 import errno
@@ -26,9 +25,8 @@ NOTICE = (
 def fetch_official(*, preset: Preset = OFFICIAL) -> Path:
     """Path of the converted official weights; downloads and converts the checkpoint if there are none.
 
-    A ``reli3d_final.ckpt`` in the same folder is converted without network access and kept.  A downloaded one is
-    verified with the hub's SHA-256 and removed after the conversion; interrupted downloads resume at the next call.
-    Raises WeightsError if the extra ``hub``, network, access rights, the file or disk space is missing.
+    A ``reli3d_final.ckpt`` in the same folder is converted without network access and kept; a downloaded one is
+    verified by its SHA-256 and removed.  Raises WeightsError if something is missing.
     """
     target = official_path()
     if target.is_file():

@@ -1,8 +1,4 @@
-"""Illumination path: RENI++ latents from the views and the triplane.
-
-The views are tokenized a second time together with their masks, so that masked background differs from black; a bank of
-learned tokens attends to them and to the triplane.  Parameter names are the published checkpoint's.
-"""
+"""Illumination path: RENI++ latents from the views with their masks and the triplane; published parameter names."""
 
 import torch
 from torch import Tensor, nn
@@ -68,9 +64,8 @@ class Illumination(nn.Module):
     def forward(self, images: Tensor, extra: Tensor | None, camera: Tensor, planes: Tensor) -> tuple[Tensor, ...]:
         """Latents ``(B, L, 3)``, rotation ``(B, 3, 3)``, strength ``(B,)``, float32.
 
-        images: ``(B, V, S, S, 3)`` sRGB, masked background black.  extra: ``(B, V, K, S, S)``, the mask (all ones where
-        the background is visible), if the preset has a mask channel.  camera: ``(B, V, W)``.  planes: ``(B, 3, C, P,
-        P)`` before upsampling.
+        images: ``(B, V, S, S, 3)`` sRGB, masked background black.  extra: ``(B, V, K, S, S)``, the mask, if the preset
+        has a mask channel.  camera: ``(B, V, W)``.  planes: ``(B, 3, C, P, P)`` before upsampling.
         """
         views = self.encoder(images, camera, extra).flatten(1, 2)
         of_planes = planes.movedim(2, -1).flatten(1, 3)  # plane by plane, row by row
@@ -80,10 +75,6 @@ class Illumination(nn.Module):
 
 
 def unpack(tokens: Tensor, latents: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Latents ``(B, L, 3)``, rotation ``(B, 3, 3)`` and strength ``(B,)`` from the first numbers of ``(B, C, N)``.
-
-    The numbers are read channel by channel, as published: with 78 tokens and 49 latents that is channel 0 and most of
-    channel 1; the others are not used.
-    """
+    """Latents ``(B, L, 3)``, rotation ``(B, 3, 3)``, strength ``(B,)``: the first numbers of ``(B, C, N)``."""
     latent, strength, rotation = tokens.flatten(1)[:, : 3 * latents + 7].split((3 * latents, 1, 6), dim=1)
     return latent.unflatten(1, (latents, 3)), rotation_from_6d(rotation), strength.squeeze(1) + STRENGTH_BIAS

@@ -16,8 +16,7 @@ START_DENSITY_OFFSET = 2.0  # raw density below the surface's at the start: ever
 def initialize(model: nn.Module) -> None:
     """Fill the parameters of a :class:`reli3d.nn.model.Reconstructor` in place, from torch's global generator.
 
-    Linear weights are truncated normal; modulations start as the identity, outputs of residual branches are scaled
-    down with the number of branches; normal and deformation heads start near zero; the density starts outside.
+    Linear weights are truncated normal; modulations start as the identity; the density starts outside.
     """
     for module in model.modules():
         if isinstance(module, nn.Linear):
@@ -41,7 +40,14 @@ def initialize(model: nn.Module) -> None:
         elif isinstance(module, TwoStreamTransformer):
             nn.init.trunc_normal_(module.latent_init, std=STD)
         elif isinstance(module, Heads):
-            _initialize_heads(module)
+            for name, layers in module.items():
+                for layer in layers:
+                    if isinstance(layer, nn.Linear):
+                        nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
+                        bound = 1.0 / math.sqrt(layer.in_features)
+                        nn.init.uniform_(layer.bias, -bound, bound)
+                if name in ("normal", "deformation"):
+                    _normal(layers, 0.01)
             nn.init.constant_(module["density"][-1].bias, model.surface_density - START_DENSITY_OFFSET)
         elif isinstance(module, WeightMerger):
             _normal(module.mlp, 0.05)
@@ -71,14 +77,3 @@ def _normal(layers: nn.Sequential, std: float) -> None:
         if isinstance(layer, nn.Linear):
             nn.init.normal_(layer.weight, std=std)
             nn.init.zeros_(layer.bias)
-
-
-def _initialize_heads(heads: Heads) -> None:
-    for name, layers in heads.items():
-        for layer in layers:
-            if isinstance(layer, nn.Linear):
-                nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
-                bound = 1.0 / math.sqrt(layer.in_features)
-                nn.init.uniform_(layer.bias, -bound, bound)
-        if name in ("normal", "deformation"):
-            _normal(layers, 0.01)

@@ -1,8 +1,7 @@
 """Lighting features at surface points, which let the material heads separate shading from base color.
 
-Two estimates: the irradiance of the predicted environment, and the observed brightness as a function of the normal.
-The second is a least-squares fit: over many points the base color averages out and the irradiance remains (Ramamoorthi
-and Hanrahan 2001: diffuse irradiance is well approximated by nine spherical harmonics).
+Two estimates: the irradiance of the predicted environment, and a least-squares fit of the observed brightness to nine
+spherical harmonics of the normal (Ramamoorthi and Hanrahan 2001), in which the base color averages out.
 """
 
 from dataclasses import dataclass
@@ -29,11 +28,7 @@ class Shading:
     WIDTH: ClassVar[int] = 24  # of :meth:`features`
 
     def features(self, normal: Tensor, color: Tensor) -> Tensor:
-        """Features ``(N, 24)``: normal, log(irradiance / pi), log of the observed brightness, logit of the color
-        over that brightness, palette.
-
-        normal: ``(N, 3)`` unit, world.  color: ``(N, 3)`` sRGB, observed.  No gradient.
-        """
+        """Features ``(N, 24)`` at unit ``normal (N, 3)``, observed as ``color (N, 3)``, sRGB; no gradient."""
         predicted = torch.log(self.irradiance.lookup(normal.contiguous()) / torch.pi + LOG_OFFSET)
         brightness = brightness_at(normal, self.observed)
         unlit = color_logit(unshaded(color, brightness))
@@ -46,9 +41,9 @@ def unshaded(color: Tensor, brightness: Tensor) -> Tensor:
 
 
 def palette_of(color: Tensor, unlit: Tensor, visible: Tensor) -> Tensor:
-    """Mean and standard deviation ``(12,)`` of the logits of ``color`` and ``unlit``, both ``(N, 3)`` sRGB.
+    """Mean and standard deviation ``(12,)`` of the logits of the observed ``color`` and of :func:`unshaded` colors.
 
-    color: observed.  unlit: divided by the brightness, see :func:`unshaded`.  visible: ``(N,)``, weight of each point.
+    color, unlit: ``(N, 3)``, sRGB.  visible: ``(N,)``, weight of each point.
     """
     weight = ((visible + 1e-6) / (visible + 1e-6).sum())[:, None]
     values = torch.cat([color_logit(color), color_logit(unlit)], -1)
@@ -70,14 +65,12 @@ def brightness_at(normal: Tensor, observed: Tensor) -> Tensor:
 def brightness_over_normal(color: Tensor, visible: Tensor, normal: Tensor) -> Tensor:
     """Ridge regression of linear ``color (N, 3)`` on the :func:`harmonics` of unit ``normal (N, 3)``, ``(9, 3)``.
 
-    visible: ``(N,)``, weight of each point.  The fit is divided by the weighted mean color; it is the constant 1 if no
-    point is visible or all are black.
+    visible: ``(N,)``, weights.  Relative to the weighted mean color; the constant 1 where that is black.
     """
     weight = (visible + 1e-6)[:, None]
     total, mean = weight.sum(), (weight * color).sum(0) / weight.sum()
     basis = harmonics(normal)
-    ridge = torch.full((9,), RIDGE_WEIGHT, device=color.device, dtype=torch.float32)
-    ridge[0] = 0.0
+    ridge = basis.new_tensor([0.0, *[RIDGE_WEIGHT] * 8])
     gram = (basis * weight).T @ basis / total + torch.diag(ridge)
     fit = torch.linalg.solve(gram, (basis * weight).T @ (color / mean.clamp(min=1e-3)) / total)
     fit[0] += (mean < 1e-3).float()

@@ -1,9 +1,9 @@
 """Environment estimation from surface radiance: splatting into lat-long maps, completed by a U-Net on the sphere.
 
 Glossy pixels reflect the light from their mirror direction, diffuse ones the light around their normal.  Both are
-splatted bilinearly into lat-long maps.  The U-Net, which wraps in azimuth, completes unobserved directions; the result
-is equivariant to rotation about +Y by multiples of the coarsest texel.  The network was trained on maps with -Z at the
-horizontal center and +X to its right; the result has the layout of :mod:`reli3d.render.latlong`.
+splatted bilinearly into lat-long maps.  The U-Net completes unobserved directions, equivariant to rotation about +Y by
+multiples of the coarsest texel.  It was trained on maps with -Z at the horizontal center and +X to its right; the
+result has the layout of :mod:`reli3d.render.latlong`.
 """
 
 import torch
@@ -78,16 +78,12 @@ class LightMap(nn.Module):
         demodulated = log - (albedo + MIN_ALBEDO).log()
         mean = (demodulated * facing[:, None]).sum(0) / facing.sum().clamp(min=1e-4)
         scale = 256.0 / max(1, len(radiance))  # makes weights independent of the views' resolution
-        at_mirror = trained_texels(mirror, self.height)
-        shown, shown_weight = splat(
-            torch.cat([log - mean, demodulated - mean], -1), facing * (0.05 + gloss) * scale, at_mirror, self.height
-        )
-        at_normal = trained_texels(normal, self.height)
-        under, under_weight = splat(demodulated - mean, facing * scale, at_normal, self.height)
+        reflected, weight = torch.cat([log - mean, demodulated - mean], -1), facing * (0.05 + gloss) * scale
+        shown = splat(reflected, weight, trained_texels(mirror, self.height), self.height)
+        under = splat(demodulated - mean, facing * scale, trained_texels(normal, self.height), self.height)
         y = lat_long_directions(self.height, device=radiance.device)[..., 1][None]
-        rest = torch.cat([y, y.square(), torch.ones_like(y) * mean.mean()])
-        x = self.first(torch.cat([shown, shown_weight, under, under_weight, rest])[None])
-        levels = [x]
+        x = torch.cat([*shown, *under, y, y.square(), torch.ones_like(y) * mean.mean()])
+        levels = [self.first(x[None])]
         for down in self.down:
             levels.append(down(levels[-1]))
         x = levels[-1]

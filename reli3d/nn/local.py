@@ -1,9 +1,8 @@
 """The small network: convolutions over each view, over space and over the sphere of directions.
 
-A 2D U-Net predicts base color, normal and depth per pixel of every view (``pyramid``); depths are refined by comparing
-the views (``cost_volume``); a 3D U-Net pools the views over the volume of the object (``volume``); a U-Net on lat-long
-maps completes the environment from the radiance that the surface reflects (``light_map``).  Small MLPs evaluate points
-from all three.  Positions enter only relative to the views and to the object.
+A 2D U-Net predicts base color, normal and depth of every pixel (``pyramid``); depths are refined by comparing the views
+(``cost_volume``); a 3D U-Net pools the views over the volume of the object (``volume``); a U-Net on lat-long maps
+completes the environment (``light_map``).  Small MLPs evaluate points from all.  Positions are relative to the views.
 """
 
 from __future__ import annotations
@@ -71,8 +70,7 @@ class PixelMaps:
         """Decodes the pyramid's output ``raw (V, P, P, 12)`` at the pixels of ``camera``.
 
         span: ``(V, Q, Q, 2)``, depths at which each ray enters and leaves the hull.  mean: :func:`mean_logit` of the
-        object, broadcast over the pixels.  The gain applies to the difference from ``mean``, because exposure makes the
-        absolute brightness of an object ambiguous, but not its hue and contrast.
+        object, from which the gain applies: exposure makes the absolute brightness ambiguous, but not the contrast.
         """
         gain, shift, confidence, rough, metal, normal, depth, chroma = raw.split([1, 3, 1, 1, 1, 3, 1, 1], -1)
         x, y = image_plane(camera)
@@ -160,9 +158,7 @@ class LocalReconstructor(nn.Module):
         return torch.bfloat16 if self.pyramid.in_bfloat16 else torch.float32
 
     def to_compute(self, dtype: torch.dtype) -> LocalReconstructor:
-        """Sets the compute dtype of the U-Nets' convolutions, float32 or bfloat16; parameters, results and the cost
-        volume stay float32.  Raises ValueError for another dtype.
-        """
+        """Sets the compute dtype of the U-Nets' convolutions, float32 or bfloat16, else ValueError."""
         if dtype not in (torch.float32, torch.bfloat16):
             raise ValueError(f"dtype: expected float32 or bfloat16, got {dtype}")
         self.pyramid.in_bfloat16 = self.volume.in_bfloat16 = dtype == torch.bfloat16
@@ -186,27 +182,22 @@ class LocalReconstructor(nn.Module):
         4)`` OpenGL.  intrinsics: ``(V, 4)`` in pixels of ``images``.  detail: ``(V, D, D, 4)``, sRGB and signed
         silhouette distance in pixels, from which colors are read.  detail_intrinsics: ``(V, 4)`` in its pixels.
         mirrored: number of views at the end that are the first views, flipped left to right, with mirrored cameras;
-        they are used for shape and material, not for lighting.  inference: without gradient; the field evaluates points
-        by fused kernels, equal to float32 rounding, in blocks that fit the cache.  Gradients reach every parameter,
-        those of the cost volume with two or more input views.  Raises ValueError if more than half of the views are
-        mirrored.
+        they are used for shape and material, not for lighting.  inference: without gradient, by fused kernels, equal to
+        float32 rounding.  Gradients reach every parameter, those of the cost volume with two or more input views.
+        Raises ValueError if more than half of the views are mirrored.
         """
         with torch.set_grad_enabled(torch.is_grad_enabled() and not inference):
             views = images, masks, c2w, intrinsics, detail, detail_intrinsics
-            return self._encoded(views, mirrored, inference)
-
-    def _encoded(self, views: tuple[Tensor, ...], mirrored: int, inference: bool) -> LocalField:
-        images, masks, c2w, intrinsics, detail, detail_intrinsics = views
-        features, pixels, camera = self.read_pixels(*views, mirrored=mirrored)
-        color, mask = pixel_colors(images, masks, camera)
-        tokens = torch.cat([features, pixels.shape_at(features.shape[1])], -1).contiguous()
-        maps = ViewMaps(tokens, detail, Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1]), mirrored)
-        surface = torch.cat([pixels.depth * mask, pixels.spread * mask, mask], -1)
-        volume = self.volume(maps, surface, self.widening)
-        lit = mask[..., 0].clone()
-        lit[maps.input_count :] = 0.0
-        log_light = self._light(pixels, color, lit, camera)
-        return LocalField(maps, self, pixels, color, surface, volume, log_light, inference=inference)
+            features, pixels, camera = self.read_pixels(*views, mirrored=mirrored)
+            color, mask = pixel_colors(images, masks, camera)
+            tokens = torch.cat([features, pixels.shape_at(features.shape[1])], -1).contiguous()
+            maps = ViewMaps(tokens, detail, Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1]), mirrored)
+            surface = torch.cat([pixels.depth * mask, pixels.spread * mask, mask], -1)
+            volume = self.volume(maps, surface, self.widening)
+            lit = mask[..., 0].clone()
+            lit[maps.input_count :] = 0.0
+            log_light = self._light(pixels, color, lit, camera)
+            return LocalField(maps, self, pixels, color, surface, volume, log_light, inference=inference)
 
     @property
     def widening(self) -> Tensor | float:
@@ -214,11 +205,7 @@ class LocalReconstructor(nn.Module):
         return 0.0 if self.cost_volume is None else self.cost_volume.widening
 
     def read_pixels(self, *views: Tensor, mirrored: int = 0) -> tuple[Tensor, PixelMaps, Camera]:
-        """The per-view maps of :meth:`encode`: features at a quarter of the resolution, predictions at half, and the
-        cameras of the predictions.  The maps of mirror images are those of the input views, flipped.
-
-        views: the six tensors of :meth:`encode`.
-        """
+        """Features and predictions of the ``views`` of :meth:`encode`, and the cameras of the predictions."""
         images, masks, c2w, intrinsics, detail, detail_intrinsics = views
         if not 0 <= 2 * mirrored <= len(images):
             raise ValueError(f"mirrored: expected at most half of the {len(images)} views, got {mirrored}")
@@ -263,10 +250,7 @@ class LocalReconstructor(nn.Module):
 def _refined_depth(
     volume: CostVolume, pixels: PixelMaps, features: Tensor, images: Tensor, masks: Tensor, span: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    """Depth of ``pixels`` plus the correction by ``volume``, and its standard deviation, ``(V, P, P, 1)``.
-
-    Correction and deviation are upsampled bilinearly from half the resolution.
-    """
+    """Depth of ``pixels`` plus the correction by ``volume``, and its deviation, ``(V, P, P, 1)``, upsampled."""
     count = len(features)
     quarter = camera.resized(features.shape[2], features.shape[1])
     color, coverage = pixel_colors(images[:count], masks[:count], quarter)
@@ -302,17 +286,11 @@ class LocalField:
     inference: bool = False  # points are evaluated without gradient, see LocalReconstructor.encode
 
     def bound(self, points: Tensor) -> Tensor:
-        """Signed distance ``(N,)`` to the visual hull in units of ``softness``, a lower bound of :meth:`sdf`.
-
-        Negative inside.  No gradient.
-        """
+        """Signed distance ``(N,)`` to the visual hull over ``softness``: a lower bound of :meth:`sdf`; no gradient."""
         return -hull_distance(points, self.maps.silhouette, self.maps.camera) / self.model.preset.softness
 
     def grid_bound(self, axis: Tensor, far: float) -> Tensor:
-        """:meth:`bound` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; axis: ``(n,)`` ascending.
-
-        Where it exceeds ``far``, the result is any value above ``far``.
-        """
+        """:meth:`bound` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; above ``far`` any such value."""
         softness = self.model.preset.softness
         return -hull_grid(axis, self.maps.silhouette, self.maps.camera, far=far * softness) / softness
 
@@ -346,7 +324,7 @@ class LocalField:
         model, maps = self.model, self.maps.inputs  # mirror images already contribute through the volume
         hull = -bound * model.preset.softness
         views = model.view_features.fused if self.inference else model.view_features
-        of_views, _ = views(maps, points, None if visible is None else visible[:, : maps.input_count], normal)
+        of_views = views(maps, points, None if visible is None else visible[:, : maps.input_count], normal)
         of_space = model.volume.sample(self.volume, points)
         rest = [(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(self.maps.images))]
         ahead = ahead_of_surface(self.surface[: maps.input_count], maps, points, model.widening)
@@ -391,10 +369,7 @@ class LocalField:
             return replace(self, shading=Shading(irradiance, observed, palette_of(color, unlit, visible_in_any)))
 
     def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> SurfacePoints:
-        """Surface points with material.
-
-        position, geometric normal: ``(N, 3)``, unit.  visible: ``(N, V)``, 1 where the view sees the point.
-        """
+        """Surface points with material.  normal: geometric, unit.  visible: ``(N, V)``, 1 where a view sees it."""
 
         def evaluate(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
             fused = self.fused(position, normal, visible)
@@ -403,11 +378,7 @@ class LocalField:
         return SurfacePoints(position, normal, **self._rows(evaluate, position, normal, visible))
 
     def heads(self, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
-        """Raw head outputs ``(N, HEAD_OUTPUTS)`` at surface points, for :meth:`material_from_heads`.
-
-        Arguments as in :meth:`material`.  The outputs vary at the scale of volume cells, not of texels, so they may be
-        evaluated at vertices and interpolated.
-        """
+        """Raw outputs ``(N, HEAD_OUTPUTS)`` for :meth:`material_from_heads`: smooth, so that vertices suffice."""
         evaluate = lambda p, n, v: {"heads": self._heads(self.fused(p, n, v), p, n, v)}  # noqa: E731
         return self._rows(evaluate, position, normal, visible)["heads"]
 

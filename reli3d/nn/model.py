@@ -7,21 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from reli3d._bridge import check
 from reli3d.geometry.triplane import sample_triplane
+from reli3d.nn import tokenizers
 from reli3d.nn.blocks import linear_of
 from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
 from reli3d.nn.illumination import Illumination
 from reli3d.nn.initialize import initialize
 from reli3d.nn.presets import Preset
 from reli3d.nn.reni import EnvironmentDecoder, reni_frame
-from reli3d.nn.tokenizers import (
-    CameraEmbedder,
-    ImageTokenizer,
-    PixelShuffleUpsampler,
-    TriplaneBank,
-    camera_vector,
-    patch_grid,
-)
 from reli3d.nn.transformer import TwoStreamTransformer
 
 BACKGROUND = 0.5  # gray behind the object in the object encoder's images, sRGB
@@ -41,19 +35,18 @@ class Code:
 class Reconstructor(nn.Module):
     """The ReLi3D network with the sizes of ``preset``, its parameters ready for training from scratch.
 
-    Built under ``torch.device("meta")`` it allocates nothing.  The trunk computes in its parameters' dtype (see
-    :meth:`to_compute`); heads, environment decoder and every output are float32.
+    On the meta device it allocates nothing.  The trunk computes in its parameters' dtype, the rest in float32.
     """
 
     def __init__(self, preset: Preset):
         super().__init__()
         self.preset = preset
         width = preset.encoder.hidden
-        self.camera = CameraEmbedder(preset.camera_width)
-        self.encoder = ImageTokenizer(preset.encoder, preset.camera_width)
-        self.bank = TriplaneBank(width, preset.plane_size)
+        self.camera = tokenizers.CameraEmbedder(preset.camera_width)
+        self.encoder = tokenizers.ImageTokenizer(preset.encoder, preset.camera_width)
+        self.bank = tokenizers.TriplaneBank(width, preset.plane_size)
         self.backbone = TwoStreamTransformer(preset.backbone, width)
-        self.upsampler = PixelShuffleUpsampler(preset.upsampler, width)
+        self.upsampler = tokenizers.PixelShuffleUpsampler(preset.upsampler, width)
         self.illumination = Illumination(preset.illumination, preset.reni.latents, preset.camera_width, width)
         self.environment = EnvironmentDecoder(preset.reni)
         self.heads = Heads(3 * preset.upsampler.channels, preset.head_width)
@@ -95,43 +88,40 @@ class Reconstructor(nn.Module):
         Gradients reach every parameter on the way and the inputs.  Raises TypeError unless float32, ValueError on
         shapes that do not belong together and on another device than the parameters'.
         """
-        check_views(images, masks, c2w, intrinsics, self.preset.image_size, self.device)
-        camera = self.camera(camera_vector(c2w, intrinsics, images.shape[2]))
-        dtype = self.dtype
-        sizes, light = self.preset.encoder, self.preset.illumination.encoder
-
-        def extra(encoder, mask):
-            return mask.unsqueeze(2).to(dtype) if encoder.mask_channel else None
-
+        size, lead = self.preset.image_size, tuple(images.shape[:2])
+        check("images", images, shape=("B", "V", size, size, 3), like=self.camera.linear.weight)
+        check("masks", masks, shape=(*lead, size, size), like=images)
+        check("c2w", c2w, shape=(*lead, 4, 4), like=images)
+        check("intrinsics", intrinsics, shape=(*lead, 4), like=images)
+        if 0 in lead:
+            raise ValueError(f"images: expected at least one object and one view, got {lead}")
+        camera = self.camera(tokenizers.camera_vector(c2w, intrinsics, images.shape[2]))
+        extra = lambda sizes, mask: mask.unsqueeze(2).to(self.dtype) if sizes.mask_channel else None  # noqa: E731
         composite = torch.lerp(torch.full_like(images, BACKGROUND), images, masks.unsqueeze(-1))
-        tokens = self.encoder(composite, camera, extra(sizes, masks))
+        tokens = self.encoder(composite, camera, extra(self.preset.encoder, masks))
         planes = self.bank.planes(self.backbone(self.bank.tokens(), tokens))
         shown = masks
         if background_visible is not None:
             shown = torch.where(background_visible[:, None, None, None], torch.ones_like(masks), masks)
-        lit = images * shown.unsqueeze(-1)
-        latent, rotation, strength = self.illumination(lit, extra(light, shown), camera, planes)
+        with_mask = extra(self.preset.illumination.encoder, shown)
+        light = self.illumination(images * shown.unsqueeze(-1), with_mask, camera, planes)
         triplane = self.upsampler(planes).float().movedim(2, -1).contiguous().movedim(-1, 2)  # as sample_triplane reads
-        return Code(triplane, patch_grid(tokens), latent, rotation, strength)
+        return Code(triplane, tokenizers.patch_grid(tokens), *light)
 
     def decode_environment(self, code: Code, height: int | None = None) -> Tensor:
         """Linear radiance ``(B, H, 2H, 3)``, upper edge +Y, horizontal center +X; default height the preset's."""
         return self.environment(code.latent, code.rotation, code.strength, height)
 
     def radiance(self, code: Code, directions: Tensor) -> Tensor:
-        """Linear radiance ``(B, N, 3)`` from world directions ``(B or 1, N, 3)``, unit, y up.
-
-        Gradients reach the latents, the rotation, the strength, the decoder and the directions.
-        """
+        """Linear radiance ``(B, N, 3)`` from world directions ``(B or 1, N, 3)``, unit, y up; differentiable."""
         return self.environment.radiance(code.latent, code.rotation, code.strength, reni_frame(directions))
 
     def query(self, code: Code, points: Tensor, heads: Sequence[str] = tuple(HEADS)) -> dict[str, Tensor]:
         """Values of the named heads at points of the model's cube, ``{name: (B, N, outputs)}``, float32.
 
-        points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.  ``density`` is
-        the raw value, see :meth:`sdf`; ``base_color`` is sRGB-encoded; ``roughness`` is perceptual; ``normal`` is
-        unit in the frame of :mod:`reli3d.render.bump`; ``deformation`` and ``flexicubes`` are raw, see
-        :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points and the heads.
+        points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.  Values as
+        :func:`reli3d.nn.heads.activate` describes them, roughness perceptual, normals in the frame of
+        :mod:`reli3d.render.bump`.  Gradients reach the triplane, the points and the heads.
         """
         with torch.autocast(points.device.type, enabled=False):
             values = self.heads(sample_triplane(code.triplane, points / self.preset.radius), heads)
@@ -172,20 +162,3 @@ class Reconstructor(nn.Module):
     def surface_density(self) -> float:
         """Raw density on the surface: :meth:`sdf` is zero there."""
         return math.log(self.preset.density_threshold) - self.preset.density_bias
-
-
-def check_views(
-    images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, size: int, device: torch.device
-) -> None:
-    """Raise TypeError or ValueError, ``name: expected X, got Y``, where the inputs are not what ``encode`` needs."""
-    tails = {"images": (size, size, 3), "masks": (size, size), "c2w": (4, 4), "intrinsics": (4,)}
-    lead = images.shape[:2]
-    for (name, tail), value in zip(tails.items(), (images, masks, c2w, intrinsics), strict=True):
-        if value.dtype != torch.float32:
-            raise TypeError(f"{name}: expected torch.float32, got {value.dtype}")
-        if value.shape[2:] != tail or value.shape[:2] != lead or 0 in value.shape:
-            front = tuple(lead) if name != "images" and len(lead) == 2 else ("B", "V")
-            expected = ", ".join(map(str, (*front, *tail)))
-            raise ValueError(f"{name}: expected shape ({expected}), got {tuple(value.shape)}")
-        if value.device != device:
-            raise ValueError(f"{name}: expected device {device}, got {value.device}")

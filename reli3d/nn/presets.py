@@ -1,9 +1,8 @@
 """Sizes and switches of the networks, as plain numbers.
 
-``official`` has the sizes of the published checkpoint (1.574 billion parameters); where the paper and its release
-differ the release is followed, so that its weights load.  ``tiny`` is the same network with 0.6 million parameters:
-its training runs on two cores and shows that the stages work.  ``small`` is the default, a network of convolutions
-whose weights are in the package.
+``official`` has the sizes of the published checkpoint (1.574 billion parameters), also where the paper differs.
+``tiny`` is the same network with 0.6 million parameters, which two cores can train.  ``small`` is the default, a
+network of convolutions whose weights are in the package.
 """
 
 import dataclasses
@@ -39,22 +38,19 @@ class _Checked:
 
     def __post_init__(self):
         for name, kind in typing.get_type_hints(type(self)).items():
-            self._check(name, kind, getattr(self, name))
-
-    def _check(self, name: str, kind: type, value) -> None:
-        low, high = LIMITS.get(name, (1, MAX_SIZE))
-        if kind in (int, float):
-            kinds = (int,) if kind is int else (int, float)
-            what = "an integer" if kind is int else "a number"
-            _expect(type(value) in kinds and low <= value <= high, name, f"{what} from {low:g} to {high:g}", value)
-        elif typing.get_origin(kind) is tuple:
-            known = isinstance(value, tuple) and all(type(v) is int for v in value)
-            known = known and 1 <= len(value) <= MAX_LEVELS
-            widths = known and all(2 <= v < 16 or 16 <= v <= MAX_SIZE and v % 8 == 0 for v in value)
-            expected = f"1 to {MAX_LEVELS} widths, each 2 to 15 or a multiple of 8 up to {MAX_SIZE}"
-            _expect(widths, name, expected, value)  # normalized over groups of eight channels
-        else:
-            _expect(isinstance(value, kind), name, kind.__name__, value)
+            value, (low, high) = getattr(self, name), LIMITS.get(name, (1, MAX_SIZE))
+            if kind in (int, float):
+                expected = f"{'an integer' if kind is int else 'a number'} from {low:g} to {high:g}"
+                holds = type(value) in (int, kind) and low <= value <= high
+            elif typing.get_origin(kind) is tuple:  # widths, normalized over groups of eight channels
+                expected = f"1 to {MAX_LEVELS} widths, each 2 to 15 or a multiple of 8 up to {MAX_SIZE}"
+                holds = isinstance(value, tuple) and 1 <= len(value) <= MAX_LEVELS
+                holds = holds and all(
+                    type(v) is int and (2 <= v < 16 or 16 <= v <= MAX_SIZE and v % 8 == 0) for v in value
+                )
+            else:
+                expected, holds = kind.__name__, isinstance(value, kind)
+            _expect(holds, name, expected, value)
 
 
 def _expect(holds: bool, name: str, expected: str, value) -> None:
@@ -196,8 +192,8 @@ class LocalPreset(_Checked):
     def __post_init__(self):
         super().__post_init__()
         coarsest = 2 ** len(self.pyramid.widths)
-        holds = self.image_size % coarsest == 0
-        _expect(holds, "image_size", f"a multiple of {coarsest}, as there are levels of pyramid", self.image_size)
+        expected = f"a multiple of {coarsest}, as there are levels of pyramid"
+        _expect(self.image_size % coarsest == 0, "image_size", expected, self.image_size)
 
 
 @dataclass(frozen=True)
@@ -268,6 +264,9 @@ def _build(kind, values, path: str):
         raise ValueError(f"{path}.{error}") from None
 
 
+OFFICIAL_LIGHT = EncoderSizes(hidden=384, layers=12, heads=6, patch=14, grid=37, mask_channel=True)
+TINY_LIGHT = EncoderSizes(hidden=32, layers=1, heads=2, patch=8, grid=8, mask_channel=True)
+
 OFFICIAL = Preset(
     name="official",
     image_size=512,
@@ -278,13 +277,7 @@ OFFICIAL = Preset(
     upsampler=UpsamplerSizes(convolutions=4, scale=4, channels=40),
     head_width=64,
     illumination=IlluminationSizes(
-        encoder=EncoderSizes(hidden=384, layers=12, heads=6, patch=14, grid=37, mask_channel=True),
-        tokens=78,
-        token_width=256,
-        width=1024,
-        heads=16,
-        layers=4,
-        groups=16,
+        OFFICIAL_LIGHT, tokens=78, token_width=256, width=1024, heads=16, layers=4, groups=16
     ),
     reni=ReniSizes(latents=49, width=128, layers=6, heads=8, height=64),
     resolution=80,
@@ -302,15 +295,7 @@ TINY = Preset(
     backbone=BackboneSizes(heads=2, latents=32, blocks=1, basic_blocks=1, experts=0, experts_from=0, groups=8),
     upsampler=UpsamplerSizes(convolutions=2, scale=4, channels=16),
     head_width=32,
-    illumination=IlluminationSizes(
-        encoder=EncoderSizes(hidden=32, layers=1, heads=2, patch=8, grid=8, mask_channel=True),
-        tokens=16,
-        token_width=16,
-        width=32,
-        heads=2,
-        layers=1,
-        groups=4,
-    ),
+    illumination=IlluminationSizes(TINY_LIGHT, tokens=16, token_width=16, width=32, heads=2, layers=1, groups=4),
     reni=ReniSizes(latents=9, width=32, layers=2, heads=4, height=16),
     resolution=24,
     reads_background=True,

@@ -1,8 +1,6 @@
-"""The published checkpoint's names in ours: one table, and the one rule for parameters that it stores twice.
+"""The published checkpoint's names in ours.
 
-A name keeps its tail; only the front changes, by the first row that fits.  The published model registered the camera
-modulation of every encoder layer a second time under ``modulations``: index 2i is the first norm of layer i, 2i + 1 the
-second.
+A name keeps its tail.  ``modulations`` 2i and 2i + 1 are those of the norms of layer i, which are stored twice.
 """
 
 import re
@@ -30,17 +28,15 @@ KEY_MAP = (  # published, ours
     ("object_representation.indices_merging_mlp.heads.flexicubes-weight.", "merger.mlp."),
 )
 UNUSED = "material.tone_mapping."  # constants of an identity, which have no effect in the published model either
-_ALIAS = re.compile(r"(encoder\.)modulations\.(\d+)\.")
+ALIAS = re.compile(r"(encoder\.)modulations\.(\d+)\.")
 
 
 def our_key(published: str) -> str | None:
     """Our name of a published parameter, ``system.`` already taken off; None where the table has no row for it."""
     for theirs, ours in KEY_MAP:
         if published.startswith(theirs):
-            return _ALIAS.sub(_modulation, ours + published[len(theirs) :])
+            return ALIAS.sub(
+                lambda m: f"{m[1]}model.encoder.layer.{int(m[2]) // 2}.norm{1 + int(m[2]) % 2}_modulation.",
+                ours + published[len(theirs) :],
+            )
     return None
-
-
-def _modulation(match: re.Match) -> str:
-    index = int(match[2])
-    return f"{match[1]}model.encoder.layer.{index // 2}.norm{1 + index % 2}_modulation."

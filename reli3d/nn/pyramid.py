@@ -1,8 +1,4 @@
-"""2D U-Net on every view, which predicts base color, roughness, metallic, normal and depth per pixel.
-
-Convolutions are local and translation-equivariant and so need far fewer training objects than a transformer.  Source:
-Ronneberger et al. 2015, U-Net, arXiv 1505.04597.
-"""
+"""2D U-Net on every view, which predicts material, normal and depth per pixel (Ronneberger et al. 2015, 1505.04597)."""
 
 from collections.abc import Sequence
 
@@ -36,11 +32,7 @@ def depth_of_origin(c2w: Tensor) -> Tensor:
 
 
 def pixel_positions(camera: Camera) -> Tensor:
-    """Coordinates ``(V, S, S, 2)`` [world units, right and up] where pixel rays hit the plane through the world origin
-    parallel to the image plane.  They encode the scale and the position of a crop.
-
-    camera: ``V`` views of ``S`` by ``S`` pixels.
-    """
+    """Right and up ``(V, S, S, 2)`` where pixel rays hit the plane through the origin parallel to the image."""
     c2w = camera.c2w
     depth = depth_of_origin(c2w)[:, None, None]
     x, y = image_plane(camera)
@@ -68,18 +60,15 @@ class ImagePyramid(nn.Module):
     """Features of every view at a quarter of its resolution and predictions at half.
 
     Level ``k`` has ``S / 2**(k + 1)`` pixels a side.  Each of the ``sizes.reading`` finest levels also reads the image
-    at its own resolution and adds a residual to the prediction of the coarser levels.  Coarse levels can therefore be
-    trained first, on small images; finer ones are initialized to add zero.  The coarsest level has one mean vector
-    between the views, which have common lighting.  ``in_bfloat16``: compute dtype of the convolutions; parameters and
-    results are float32.
+    at its own resolution and adds a residual to the prediction, initially zero, so that coarse levels can be trained
+    first, on small images.  The coarsest level has one mean vector between the views, which have common lighting.
+    ``in_bfloat16``: compute dtype of the convolutions; parameters and results are float32.
     """
 
     in_bfloat16 = False
 
     def __init__(self, sizes: PyramidSizes, finest: int = 0):
-        """finest: the finest level that is built; images are ``2**finest`` times smaller, and unless it is 0 there are
-        no features.
-        """
+        """finest: finest level that is built, for images ``2**finest`` times smaller; above 0 without features."""
         super().__init__()
         widths, reading = sizes.widths, range(finest, sizes.reading)
         if not reading:
@@ -93,28 +82,23 @@ class ImagePyramid(nn.Module):
         self.shared = nn.Linear(widths[-1], widths[-1])
         self.across = nn.ModuleDict({k: nn.Conv2d(coarse, fine, 1) for k, (fine, coarse) in pairs.items()})
         self.up = nn.ModuleDict({k: block(fine, fine) for k, (fine, _) in pairs.items()})
-        predicted = {
-            str(k): nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], PREDICTIONS, 1)) for k in reading
-        }
-        self.says = nn.ModuleDict(predicted)
+        last = {k: nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], PREDICTIONS, 1)) for k in reading}
+        self.says = nn.ModuleDict({str(k): head for k, head in last.items()})
         if finest == 0:
             self.features = nn.Conv2d(widths[1], sizes.features, 1)
-        for head in predicted.values():
-            for value in head[1].parameters():
-                nn.init.zeros_(value)
-        for k in reading[1:]:  # finer levels start by adding zero
-            for value in down[str(k)][1].parameters():
+        # finer levels start by adding zero
+        for layer in (*(head[1] for head in last.values()), *(down[str(k)][1] for k in reading[1:])):
+            for value in layer.parameters():
                 nn.init.zeros_(value)
 
     def forward(
         self, images: Tensor, masks: Tensor, place: Tensor, span: Tensor, counts: Sequence[int] | None = None
     ) -> tuple[Tensor | None, Tensor]:
         """Features ``(V, S/4, S/4, F)``, None if ``finest`` > 0, and raw predictions ``(V, S/2, S/2, C)`` of views.
-        Gradients reach every parameter.
 
         images: ``(V, S, S, 3)`` sRGB.  masks: ``(V, S, S)``.  place: ``(V, S, S, 2)`` from :func:`pixel_positions`.
         span: ``(V, S / k, S / k, 2)`` from :func:`pixel_hull_depths`.  S is a multiple of ``2**levels``.  counts:
-        number of views of each object, in order; None if all are of one object.
+        number of views of each object, in order; None if all are of one object.  Gradients reach every parameter.
         """
         counts = [len(masks)] if counts is None else counts
         inverse = torch.cat([masks.new_full((count,), 1.0 / count) for count in counts])

@@ -2,10 +2,8 @@
 
 Source: Gardner, Egger and Smith 2023, "RENI++", arXiv 2311.09361, in the form and with the parameter names of the file
 published with ReLi3D.  An environment is a set of latent 3-vectors; rotating them about the vertical rotates the map.
-The decoder uses a z-up frame, D = (z, x, y) of the y-up world direction (x, y, z).  It is evaluated in float32.
-
-The published maps have -Z at the horizontal center and +X right of it; :func:`~reli3d.render.latlong.quarter_turn`
-converts.  Maps of this package are those of :mod:`reli3d.render.latlong`.
+The decoder uses a z-up frame, D = (z, x, y) of the y-up world direction (x, y, z), and float32.  The published maps
+have -Z at the horizontal center and +X right of it; those here are of :mod:`reli3d.render.latlong`.
 """
 
 import math
@@ -31,9 +29,8 @@ def reni_frame(directions: Tensor) -> Tensor:
 class _VnInvariant(nn.Module):
     """Two rotation invariants of a 2D vector p: <p, out_o> of a small vector-neuron network.
 
-    Every channel of that network is a multiple of p, so only the factors are computed: with alpha = W a, beta = U a and
-    n = |p| the result is alpha n^2, minus the component along k = beta p where alpha and beta differ in sign.  As in
-    the published network, the projection uses k and not its unit vector.
+    Every channel of it is a multiple of p: with alpha = W a, beta = U a and n = |p| the result is alpha n^2, minus the
+    component along k = beta p (not its unit vector, as published) where alpha and beta differ in sign.
     """
 
     def __init__(self):
@@ -76,16 +73,11 @@ class _Decoder(nn.Module):
         self.fc = nn.Linear(sizes.width, 3)
 
     def forward(self, features: Tensor, condition: Tensor) -> Tensor:
-        x = self.residual_projection(positional_encoding(features))
+        s = (features.unsqueeze(-1) * features.new_tensor(FREQUENCIES)).flatten(-2)  # frequencies vary fastest
+        x = self.residual_projection(torch.cat([s.sin(), (s + 0.5 * math.pi).sin(), features], dim=-1))
         for layer in self.layers:
             x = layer(x, condition)
         return self.fc(x)
-
-
-def positional_encoding(x: Tensor) -> Tensor:
-    """``(..., F)`` to ``(..., 5 F)``: sines, sines shifted by pi / 2, then ``x``; frequencies vary fastest."""
-    s = (x.unsqueeze(-1) * x.new_tensor(FREQUENCIES)).flatten(-2)
-    return torch.cat([s.sin(), (s + 0.5 * math.pi).sin(), x], dim=-1)
 
 
 class ReniField(nn.Module):
@@ -111,10 +103,7 @@ class ReniField(nn.Module):
         return torch.cat([horizontal @ latent[..., :2].transpose(1, 2), rest], dim=-1)
 
     def forward(self, latent: Tensor, directions: Tensor) -> Tensor:
-        """Logarithm of the radiance, ``(B, N, 3)``.
-
-        latent: ``(B, L, 3)``.  directions: ``(B or 1, N, 3)`` unit; both in the decoder's frame.  Gradients reach both.
-        """
+        """Log radiance ``(B, N, 3)`` of ``(B, L, 3)`` in ``(B or 1, N, 3)`` of the decoder's frame; differentiable."""
         return self.network(self.directional(latent, directions), self.conditioning(latent).unsqueeze(1))
 
 
@@ -133,11 +122,7 @@ class EnvironmentDecoder(nn.Module):
         self.register_buffer("sample_directions", directions)
 
     def forward(self, latent: Tensor, rotation: Tensor, strength: Tensor, height: int | None = None) -> Tensor:
-        """Linear radiance ``(B, H, 2H, 3)``, upper edge +Y, horizontal center +X.
-
-        latent: ``(B, L, 3)``.  rotation: ``(B, 3, 3)`` applied to every latent.  strength: ``(B,)``, natural logarithm
-        of a factor.
-        """
+        """Linear radiance ``(B, H, 2H, 3)``, upper edge +Y, horizontal center +X; arguments as in ``Code``."""
         height = height or self.height
         directions = reni_frame(lat_long_directions(height, device=latent.device)).reshape(1, -1, 3)
         radiance = self.radiance(latent, rotation, strength, directions)
@@ -152,10 +137,7 @@ class EnvironmentDecoder(nn.Module):
 
 
 def rotation_from_6d(d: Tensor) -> Tensor:
-    """Rotation matrices ``(..., 3, 3)`` from ``(..., 6)``: two columns, orthonormalized, and their cross product.
-
-    Source: Zhou et al. 2019, arXiv 1812.07035.  Zero input gives a zero matrix.
-    """
+    """Rotations ``(..., 3, 3)`` from two columns ``(..., 6)``, orthonormalized (Zhou et al. 2019, arXiv 1812.07035)."""
     eps = 1.0e-7 if d.dtype != torch.float64 else 1.0e-8  # the published floors
     a, b = d[..., :3], d[..., 3:]
     x = functional.normalize(a, dim=-1, eps=eps)

@@ -10,8 +10,18 @@ from reli3d.render.latlong import lat_long_directions
 
 FLOOR = 1e-2  # of the geometric mean: added to radiances before their logarithm
 RATES = 0.1, 1e-3  # learning rate of Adam at the start and the end
-COSINE = 0.3  # weight of the color cosine loss
-PRIOR = 1e-4  # weight of the squared latents, which had a normal prior in training
+# of the terms; the latents had a normal prior in training
+WEIGHTS = {"radiance": 1.0, "color": 0.3, "latents": 1e-4}
+
+
+def terms(log_radiance: Tensor, target: Tensor, latent: Tensor) -> dict[str, Tensor]:
+    """Terms of the loss for ``log_radiance`` and the radiance ``target``, to which FLOOR is added, ``(..., 3)``."""
+    floored = torch.logaddexp(log_radiance, log_radiance.new_tensor(math.log(FLOOR)))
+    return {
+        "radiance": (floored - target.log()).abs().mean(),
+        "color": 1.0 - torch.nn.functional.cosine_similarity(log_radiance.exp() + FLOOR, target, dim=-1).mean(),
+        "latents": latent.square().mean(),
+    }
 
 
 def fit_latent(
@@ -21,9 +31,8 @@ def fit_latent(
 
     The error is the mean over the sphere of |log radiance - log map|; the latents absorb any rotation.
     radiance: ``(H, 2H, 3)`` linear, nonnegative, in the layout of :mod:`reli3d.render.latlong`, on the decoder's
-    device; H at least 8.  steps: of Adam, each on ``rays`` texels sampled uniformly over the sphere.  The loss is the
-    absolute difference of logarithms, with a floor of a hundredth of the mean, plus one minus the cosine of the colors,
-    which emphasizes light sources.  The decoder is not changed.  Raises TypeError unless float32, ValueError for
+    device; H at least 8.  steps: of Adam, each on ``rays`` texels sampled uniformly over the sphere.  The cosine of the
+    colors emphasizes light sources.  The decoder is not changed.  Raises TypeError unless float32, ValueError for
     another shape and for a map that is not finite, negative or black.  Source: Gardner et al. 2023, RENI++, section 4.
     """
     if radiance.dtype != torch.float32:
@@ -55,10 +64,8 @@ def fit_latent(
             rate = RATES[1] + (RATES[0] - RATES[1]) * 0.5 * (1.0 + math.cos(math.pi * step / steps))
             optimizer.param_groups[0]["lr"] = rate
             pick = torch.multinomial(weight.cpu(), rays, replacement=True, generator=generator).to(radiance.device)
-            log, true = logarithm(directions[pick]), target[pick]
-            cosine = torch.nn.functional.cosine_similarity(log.exp() + FLOOR, true + FLOOR, dim=-1).mean()
-            distance = (torch.logaddexp(log, floor) - (true + FLOOR).log()).abs().mean()
-            loss = distance + COSINE * (1.0 - cosine) + PRIOR * latent.square().mean()
+            found = terms(logarithm(directions[pick]), target[pick] + FLOOR, latent)
+            loss = found["radiance"] + WEIGHTS["color"] * found["color"] + WEIGHTS["latents"] * found["latents"]
             latent.grad, strength.grad = torch.autograd.grad(loss, (latent, strength))
             optimizer.step()
     with torch.no_grad():

@@ -1,8 +1,7 @@
 """Images to tokens: a vision transformer in the DINOv2 form with camera-modulated norms; triplane tokens to planes.
 
 Sources: DINOv2 (Oquab et al. 2023, arXiv 2304.07193); adaptive layer norm as in DiT (Peebles and Xie 2023, arXiv
-2212.09748); pixel shuffle (Shi et al. 2016, arXiv 1609.05158).  Parameter names are the published checkpoint's.  A
-view's tokens are, in this order: class, patches row by row, camera.
+2212.09748); pixel shuffle (Shi et al. 2016, arXiv 1609.05158).  Parameter names are the published checkpoint's.
 """
 
 import math
@@ -23,10 +22,7 @@ RESAMPLE_OFFSET = 0.1
 
 
 def camera_vector(c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """The 25 numbers of a view: camera-to-world row by row, then the 3x3 intrinsics divided by the image size.
-
-    c2w: ``(..., 4, 4)``.  intrinsics: ``(..., 4)`` fx, fy, cx, cy in pixels of an image of ``size`` by ``size``.
-    """
+    """The 25 numbers of a view: camera-to-world row by row, then the 3x3 intrinsics over the image ``size``."""
     fx, fy, cx, cy = (intrinsics / size).unbind(-1)
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     normalized = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], dim=-1)
@@ -150,11 +146,7 @@ class ImageTokenizer(nn.Module):
         )
 
     def forward(self, images: Tensor, camera: Tensor, extra: Tensor | None = None) -> Tensor:
-        """Tokens ``(B, V, 1 + patches + 1, hidden)``.
-
-        images: ``(B, V, S, S, 3)`` sRGB in [0, 1].  camera: ``(B, V, camera_width)``.
-        extra: ``(B, V, K, S, S)`` channels appended after RGB as they are.
-        """
+        """Tokens ``(B, V, 1 + patches + 1, hidden)`` of sRGB ``(B, V, S, S, 3)``; extra: channels after RGB."""
         dtype = self.model.embeddings.cls_token.dtype
         mean, std = images.new_tensor(IMAGE_MEAN), images.new_tensor(IMAGE_STD)
         pixels = ((images - mean) / std).movedim(-1, 2)

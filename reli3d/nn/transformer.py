@@ -1,8 +1,4 @@
-"""Two-stream transformer: triplane tokens and latents, which attend to each other alternately.
-
-Source: section 3 of the paper, in the form of its release: the tokens of the reference view join the latents, tokens of
-all views enter by cross-attention, and the last blocks mix experts.  Parameter names are those of the checkpoint.
-"""
+"""Two-stream transformer of the paper's release: triplane tokens and latents attend to each other alternately."""
 
 from collections.abc import Callable
 
@@ -29,10 +25,7 @@ def by_tokens(function: Callable[[Tensor], Tensor], x: Tensor, inner: int) -> Te
 
 
 def attention(q: Tensor, k: Tensor, v: Tensor, heads: int) -> Tensor:
-    """Multi-head attention ``(B, N, C)`` of queries ``(B, N, C)`` over keys and values ``(B, M, C)``.
-
-    A batch axis of 1 on either side is shared by the other side's batch.
-    """
+    """Multi-head attention ``(B, N, C)`` over keys and values ``(B, M, C)``; a batch of 1 on either side is shared."""
     batch, conflict = max(len(q), len(k)), k.device.type == "cpu" and k.shape[-1] % CONFLICT == 0
     q, k, v = (x.unflatten(-1, (heads, -1)).transpose(1, 2) for x in (q, k, v))
     if conflict:  # copying head by head makes the attention about 1.2 times faster
@@ -127,13 +120,12 @@ class MainBlock(nn.Module):
     def __init__(self, width: int, heads: int, basic_blocks: int, experts: int):
         super().__init__()
         self.fuse_block_in = FuseBlock(width, heads)
-        self.transformer_block = nn.ModuleList(self._basic(width, heads, experts) for _ in range(basic_blocks))
+        feed_forward = lambda: Experts(width, experts) if experts else FeedForward(width)  # noqa: E731
+        self.transformer_block = nn.ModuleList(
+            BasicBlock(width, Attention(width, heads), Attention(width, heads), feed_forward())
+            for _ in range(basic_blocks)
+        )
         self.fuse_block_out = FuseBlock(width, heads)
-
-    @staticmethod
-    def _basic(width: int, heads: int, experts: int) -> BasicBlock:
-        attentions = Attention(width, heads), Attention(width, heads)
-        return BasicBlock(width, *attentions, Experts(width, experts) if experts else FeedForward(width))
 
     def forward(self, latents: Tensor, planes: Tensor, views: Tensor) -> tuple[Tensor, Tensor]:
         latents = self.fuse_block_in(latents, planes)

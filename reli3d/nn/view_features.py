@@ -1,8 +1,7 @@
 """Pixel-aligned features of points from the input views, which keep the detail of the images in a small network.
 
-A point is projected into every view.  Patch tokens, color, silhouette distance and depth pass through a small MLP per
-view and are pooled over the views, so the features are order-invariant and of one width for any number of views (Yu et
-al. 2021, pixelNeRF, with pooling as in Wang et al. 2021, IBRNet).
+Patch tokens, color, silhouette distance and depth where a point projects pass through a small MLP per view and are
+pooled over the views: order-invariant, for any number of views (Yu et al. 2021, pixelNeRF; Wang et al. 2021, IBRNet).
 """
 
 from __future__ import annotations
@@ -60,10 +59,7 @@ class ViewMaps:
         return visible
 
     def _mirrored(self, scene: RayScene, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
-        """``(N, mirrored)`` float32, 1 where a point is visible in a mirror image and in no input view.
-
-        visible: ``(N, V)`` in the input views.
-        """
+        """``(N, mirrored)`` float32, 1 where a mirror image shows a point and none of the input views does."""
         rest = (~visible.any(1)).nonzero()[:, 0]
         found = position.new_zeros(len(position), self.mirrored)
         found[rest] = visible_from(scene, position[rest], normal[rest], self.camera[self.input_count :]).float()
@@ -72,9 +68,8 @@ class ViewMaps:
     def visibility_within(self, scene: RayScene, position: Tensor, normal: Tensor, corners: Tensor) -> Tensor:
         """:meth:`visibility` of points in faces, tracing rays only to views in which the corners of the face disagree.
 
-        In such faces, points visible in no input view have rays to all mirror images.
-
-        corners: ``(N, V)`` :meth:`visibility` of the corners, interpolated at the points.
+        corners: ``(N, V)`` :meth:`visibility` of the corners, interpolated at the points.  In such faces, points
+        visible in no input view have rays to all mirror images.
         """
         visible = corners.round()
         unsure = (corners - visible).abs() > INTERPOLATION_ERROR
@@ -103,9 +98,8 @@ def ahead_of_surface(surface: Tensor, maps: ViewMaps, points: Tensor, widening: 
     surface: ``(V, P, P, 3)``, pixel depth relative to the world origin's along the camera axis, its standard deviation
     ``s``, both times coverage, and coverage.  Over the views that cover the point: maximum and mean of tanh(distance /
     near), mean of tanh(distance / far), and the fraction of such views; near and far are the roots of
-    ``NEAR_DISTANCE**2 + widening * s**2`` and ``FAR_DISTANCE**2 + widening * s**2``, so that an uncertain depth counts
-    less.  Space in front of a visible surface is empty; far behind it a view has no information.  Gradients reach
-    ``surface`` and ``widening``.
+    ``NEAR_DISTANCE**2 + widening * s**2`` and ``FAR_DISTANCE**2 + widening * s**2``.  Far behind a surface a view has
+    no information.  Gradients reach ``surface`` and ``widening``.
     """
     got, pixel = gather_views(surface, points, maps.camera)
     covered = got[..., 2].clamp(min=0.1)
@@ -121,7 +115,7 @@ def ahead_of_surface(surface: Tensor, maps: ViewMaps, points: Tensor, widening: 
 
 
 class ViewFeatures(nn.Module):
-    """Pooled features ``(N, width)`` and the mean color ``(N, 3)`` of points over the views."""
+    """Features ``(N, width)`` of points, pooled over the views."""
 
     def __init__(self, token_width: int, channels: int = 16, hidden: int = 48, width: int = 48):
         super().__init__()
@@ -131,11 +125,12 @@ class ViewFeatures(nn.Module):
         )
         self.width = width
 
-    def forward(self, maps: ViewMaps, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None):
+    def forward(
+        self, maps: ViewMaps, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None
+    ) -> Tensor:
         """Features of ``points (N, 3)`` [model frame].
 
-        visible: ``(N, V)``, 1 where a surface point is visible, 0 where it is occluded; None for points in free space.
-        normal: ``(N, 3)`` unit, outward; required with ``visible``.  Gradients reach the tokens.
+        visible: ``(N, V)``, 1 where a view shows a surface point; None in free space.  normal: unit, with it.
         """
         first, activation, last = linear_of(self.per_view, 0), self.per_view[1], self.per_view[2]
         channels = self.tokens.out_features
@@ -143,14 +138,16 @@ class ViewFeatures(nn.Module):
         numbers, weight, summary = summarize_views(maps.images, maps.camera, points, visible, normal)
         hidden = linear(gathered, first.weight[:, :channels]) + linear(numbers, first.weight[:, channels:], first.bias)
         pooled = (weight[:, None] @ activation(hidden))[:, 0]
-        return torch.cat([last(pooled), summary], -1), summary[:, :3]  # the last layer is linear: pool first
+        return torch.cat([last(pooled), summary], -1)  # the last layer is linear: pool first
 
     @torch.no_grad()
-    def fused(self, maps: ViewMaps, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None):
+    def fused(
+        self, maps: ViewMaps, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None
+    ) -> Tensor:
         """:meth:`forward` by :func:`~reli3d.nn.view_lookup.pool_views`, equal to float32 rounding; no gradient."""
         first, channels = linear_of(self.per_view, 0), self.tokens.out_features
         # bilinear weights sum to 1, so the layer and its bias commute with the lookup
         tokens = linear(self.tokens(maps.tokens), first.weight[:, :channels], first.bias)
         mix = first.weight[:, channels:].T
         pooled, summary = pool_views(maps.images, tokens, mix, maps.camera, points, visible, normal)
-        return torch.cat([linear_of(self.per_view, 2)(pooled), summary], -1), summary[:, :3]
+        return torch.cat([linear_of(self.per_view, 2)(pooled), summary], -1)

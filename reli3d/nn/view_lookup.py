@@ -1,8 +1,4 @@
-"""Lookup of points in posed images for the convolutional network.
-
-:func:`summarize_views` returns the features of each view.  The other functions fuse the layers on these features and
-the pooling over the views into one kernel, without gradient; their callers have the differentiable versions in torch.
-"""
+"""Lookup of points in posed images by kernels without gradient; the callers have differentiable versions in torch."""
 
 from torch import Tensor
 
@@ -42,9 +38,8 @@ def pool_views(
     """Weighted mean over the views of a hidden layer at ``points (N, 3)``, ``(N, H)``, and the summary ``(N, 9)``.
 
     The layer of a view is ``silu(token + features @ mix)`` with ``tokens (V, P, P, H)`` interpolated where the point
-    projects, the 9 features of :func:`summarize_views` and ``mix (9, H)``.  H is a multiple of 8.  The other arguments
-    and the summary are those of :func:`summarize_views`.  No gradient; the differentiable version by
-    :func:`gather_views` and torch takes about 5 times as long.
+    projects, the 9 features of :func:`summarize_views` and ``mix (9, H)``; H is a multiple of 8.  No gradient; the
+    differentiable version by :func:`gather_views` and torch takes about 5 times as long.
     """
     n, out, viewed = _summary(images, camera, points, visible, normal)
     check("tokens", tokens, like=images)
@@ -68,10 +63,9 @@ def fuse_views(
 
     pixels: ``(3, V, P, P, 4)``: gain and three shifts; confidence, roughness, metallic, chroma; normal, 0.  The base
     color logit of a view is ``gain * m + chroma * (l - m) + shift`` with the logits ``l`` of the observed color and
-    their mean ``m``.  The blend weight is ``w**2 * exp(confidence)``; ``w`` and other arguments as in
-    :func:`summarize_views`.  Features: roughness, metallic, gain, blended normal minus ``normal``, their cosine,
-    greatest ``w``, confidence, standard deviation of the logit.  No gradient; :class:`reli3d.nn.local.LocalField` has
-    the differentiable version in torch.
+    their mean ``m``.  The blend weight is ``w**2 * exp(confidence)``; ``w`` as in :func:`summarize_views`.  Features:
+    roughness, metallic, gain, blended normal minus ``normal``, their cosine, greatest ``w``, confidence, standard
+    deviation of the logit.  No gradient; :class:`reli3d.nn.local.LocalField` has the differentiable version.
     """
     check("pixels", pixels, last=4, like=images)
     if pixels.ndim != 5 or pixels.shape[:2] != (3, len(images)) or min(pixels.shape[2:4]) < 2:

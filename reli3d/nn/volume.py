@@ -46,11 +46,7 @@ class FeatureVolume(nn.Module):
         self.side, self.radius = sizes.side, sizes.radius
 
     def forward(self, maps: ViewMaps, surface: Tensor, widening: Tensor | float = 0.0) -> Tensor:
-        """Features ``(N, N, N, F)``, indexed x, y, z; grid points far outside the visual hull enter as zeros.
-
-        surface, widening: as in :func:`~reli3d.nn.view_features.ahead_of_surface`.  Gradients reach the tokens, the
-        surface, ``widening`` and every parameter.
-        """
+        """Features ``(N, N, N, F)``, indexed x, y, z; differentiable.  surface: as in :func:`ahead_of_surface`."""
         axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device, dtype=torch.float32)
         hull = hull_grid(axis, maps.silhouette, maps.camera, far=NEAR_HULL).view(-1)
         near = (hull > -NEAR_HULL).nonzero()[:, 0]
@@ -63,8 +59,7 @@ class FeatureVolume(nn.Module):
         return x[0].float().permute(1, 2, 3, 0).contiguous()
 
     def _convolved(self, x: Tensor) -> Tensor:
-        x = self.first(x)
-        levels = [x]
+        levels = [self.first(x)]
         for down in self.down:
             levels.append(down(levels[-1]))
         x = self.deepest(levels[-1])

@@ -1,7 +1,6 @@
 """Weights in files: safetensors whose manifest is checked before anything is allocated; published files converted.
 
-A file of ours carries its preset, its license and what else the writer states in the header, so it loads by itself.  A
-pickle checkpoint is only ever read by torch's restricted reader and turned into such a file.
+A file of ours carries preset and license in its header.  Pickles are only read by torch's restricted reader.
 """
 
 import contextlib
@@ -88,10 +87,7 @@ def sha256(path: str | os.PathLike) -> str:
 
 
 def known_sha256(path: str | os.PathLike) -> str:
-    """:func:`sha256`, cached for large files in ``<file>.sha256`` with the file's size and modification time.
-
-    For records only: :func:`load` and the download verify hashes that they compute.
-    """
+    """:func:`sha256`, cached for large files in ``<file>.sha256`` with size and modification time; for records only."""
     path = Path(path)
     if _size(path) < LARGE:
         return sha256(path)
@@ -107,11 +103,7 @@ def known_sha256(path: str | os.PathLike) -> str:
 
 
 def read_manifest(path: str | os.PathLike) -> Manifest:
-    """Names, shapes and metadata of a safetensors file; reads the header only.
-
-    Raises WeightsError unless the header is whole, every tensor is of floating point and the file has the length that
-    the header states.
-    """
+    """The header of a safetensors file; WeightsError unless the file is whole and all tensors are of floating point."""
     _size(path)
     with open(path, "rb") as file:
         if file.read(4) == b"PK\x03\x04":
@@ -137,18 +129,19 @@ def _size(path: str | os.PathLike) -> int:
         raise WeightsError(path, str(error).split(": ", 1)[1]) from None
 
 
-def shapes(preset: AnyPreset) -> dict[str, tuple[int, ...]]:
-    """Name and shape of every stored tensor of the network; allocates nothing."""
-    return _shapes(_unallocated(preset))
-
-
-def _unallocated(preset: AnyPreset) -> Network:
+def unallocated(preset: AnyPreset) -> Network:
+    """The network on the meta device."""
     with torch.device("meta"):
         return network(preset).float()  # whatever the default dtype is
 
 
-def _shapes(model: Network) -> dict[str, tuple[int, ...]]:
-    return {name: tuple(value.shape) for name, value in model.state_dict().items()}
+def shapes(preset: AnyPreset) -> dict[str, tuple[int, ...]]:
+    """Name and shape of every stored tensor of the network; allocates nothing."""
+    return _shapes(unallocated(preset).state_dict())
+
+
+def _shapes(tensors: Mapping[str, Tensor | Stored]) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(value.shape) for name, value in tensors.items()}
 
 
 def check_keys(where: object, got: Mapping[str, tuple[int, ...]], expected: Mapping[str, tuple[int, ...]]) -> None:
@@ -171,17 +164,13 @@ def official_path() -> Path:
 
 
 def locate(weights: str | os.PathLike) -> Path:
-    """File of the weights called ``small``, which the package brings, or ``official``, or of a path.
-
-    Nothing is fetched: :mod:`reli3d.nn.hub` does, on request.  Raises WeightsError where there is no such file.
-    """
+    """File of the weights called ``small`` or ``official``, or of a path; nothing is fetched.  Raises WeightsError."""
+    path, fix = Path(weights), "check the path"
     if os.fspath(weights) == "small":
         path, fix = SMALL, "install the package again"
     elif os.fspath(weights) == "official":
         path = official_path()
         fix = "fetch them with reli3d download (about 7 GB, Stability AI Community License), or give a converted file"
-    else:
-        path, fix = Path(weights), "check the path"
     if not path.is_file():
         raise WeightsError(path, f"no such file of weights; {fix}")
     return path
@@ -219,13 +208,12 @@ def load(
 
     preset: expected architecture; default the one in the header.  trunk: dtype of the trunk's parameters, or compute
     dtype of the small network's convolutions; default :func:`default_trunk`, ``auto`` is :func:`fastest_dtype`.  All
-    other parameters are float32.  On a CPU, tensors stored in the requested dtype stay memory-mapped.  Names, shapes,
-    file length and, if given, the hash are checked before anything is allocated.  Raises WeightsError.
+    other parameters are float32.  Everything is checked before anything is allocated.  Raises WeightsError.
     """
     manifest = read_manifest(path)
     preset = preset or manifest.preset()
-    model = _unallocated(preset)
-    check_keys(path, {name: entry.shape for name, entry in manifest.tensors.items()}, _shapes(model))
+    model = unallocated(preset)
+    check_keys(path, _shapes(manifest.tensors), _shapes(model.state_dict()))
     if expected_sha256 is not None:
         found = sha256(path)
         if found != expected_sha256:
@@ -243,10 +231,7 @@ def load(
 def read_tensors(
     manifest: Manifest, dtypes: Mapping[str, torch.dtype], device: torch.device | str = "cpu"
 ) -> dict[str, Tensor]:
-    """The tensors named in ``dtypes``, converted to these dtypes.
-
-    On a CPU a tensor that needs no conversion is memory-mapped: read on use, never written back.
-    """
+    """The tensors named in ``dtypes``, converted to these; on a CPU memory-mapped where nothing changes."""
     with safe_open(manifest.path, "pt") as opened:
         return {name: opened.get_tensor(name).to(device, dtype) for name, dtype in dtypes.items()}
 
@@ -259,10 +244,7 @@ def save(
     dtype: torch.dtype = torch.float16,
     metadata: Mapping[str, str] | None = None,
 ) -> Manifest:
-    """Write the network's parameters as ``dtype`` (buffers as they are), its preset and license; whole or not at all.
-
-    Raises WeightsError where a value is not finite in ``dtype``: such a file would only fail later.
-    """
+    """Writes parameters as ``dtype``, preset and license, whole or not at all; WeightsError unless all are finite."""
     parameters = {name for name, _ in model.named_parameters()}
     state = {k: v.detach().to("cpu", dtype if k in parameters else v.dtype) for k, v in model.state_dict().items()}
     for name, value in state.items():
@@ -284,12 +266,10 @@ def convert_checkpoint(
 ) -> Manifest:
     """Turn a published training checkpoint into a safetensors file of ours, float32 as it is.
 
-    The checkpoint's tensors stay mapped; names go through :mod:`reli3d.nn.published`; a parameter that is stored under
-    two names must be the same under both.  Only torch's restricted reader touches the pickle: anything that would run
-    code is rejected.  Raises WeightsError, and then leaves no file.
+    Only torch's restricted reader touches the pickle: no code is run.  Raises WeightsError, and then leaves no file.
     """
     state = published_state(read_checkpoint(source), source)
-    check_keys(source, {name: tuple(value.shape) for name, value in state.items()}, shapes(preset))
+    check_keys(source, _shapes(state), shapes(preset))
     header = {"format": FORMAT, "preset": to_json(preset), "licence": license, "converted_from": sha256(source)}
     write(target, state, header)
     return read_manifest(target)

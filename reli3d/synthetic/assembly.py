@@ -20,7 +20,6 @@ class Assembly:
         self.rng = rng
         self.roles: list[str] = []
         self._solids: list[Manifold] = []
-        self._cutters: list[Manifold] = []
         self._part_of: dict[int, int] = {}
 
     def part(self, role: str) -> int:
@@ -86,16 +85,12 @@ class Assembly:
     def solid_fraction(self) -> float:
         """Volume divided by the cube of the longest side; 0 for an empty solid."""
         solid = self.joined()
-        if solid.num_tri() == 0:
-            return 0.0
-        box = np.array(solid.bounding_box()).reshape(2, 3)
-        return solid.volume() / float((box[1] - box[0]).max()) ** 3
+        return 0.0 if solid.num_tri() == 0 else solid.volume() / _longest_side(solid) ** 3
 
     def finish(self, max_faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices ``(V, 3)`` float64, faces ``(F, 3)`` and part ``(F,)`` of each face of the union.
 
-        Small disconnected pieces are removed, and the mesh is simplified to at most ``max_faces``.  Raises ValueError
-        if nothing remains.
+        Without small disconnected pieces, simplified to at most ``max_faces``.  Raises ValueError if nothing remains.
         """
         solid = self.joined()
         pieces = solid.decompose()
@@ -104,8 +99,7 @@ class Assembly:
             solid = Manifold.compose([p for p, v in zip(pieces, volume) if v > MIN_PIECE_FRACTION * volume.sum()])
         if solid.num_tri() == 0 or solid.volume() <= 0:
             raise ValueError("assembly: expected a solid, got nothing after the cuts")
-        box = np.array(solid.bounding_box()).reshape(2, 3)
-        tolerance = 2e-4 * float((box[1] - box[0]).max())
+        tolerance = 2e-4 * _longest_side(solid)
         while solid.num_tri() > max_faces:
             solid = solid.simplify(tolerance)
             tolerance *= 1.6
@@ -121,3 +115,8 @@ class Assembly:
         solid = (solid if at is None else solid.translate(tuple(map(float, at)))).as_original()
         self._part_of[solid.original_id()] = part
         return solid
+
+
+def _longest_side(solid: Manifold) -> float:
+    box = np.array(solid.bounding_box()).reshape(2, 3)
+    return float((box[1] - box[0]).max())

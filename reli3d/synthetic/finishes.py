@@ -1,15 +1,11 @@
-"""Random materials for the parts of a procedural object, by their roles.
-
-Palettes follow everyday objects: mostly grays, browns, whites and dark plastics, few saturated colors.  Colors are
-linear Rec. 709.
-"""
+"""Random materials by the roles of parts: mostly grays, browns, whites and dark plastics.  Colors: linear Rec. 709."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from reli3d.synthetic import patterns as pt
-from reli3d.synthetic.materials import Bump, Coat, Layer, Material, Pattern
+from reli3d.synthetic.materials import Coat, Layer, Material, SurfaceFunction
 
 METAL_PROBABILITY = 0.36  # that an object may have metal parts; not all of these have a suitable part
 # F0 of steel, aluminum, gold, brass, copper, bronze, iron, gunmetal, as published tables give them
@@ -52,11 +48,6 @@ def _rgb(values: np.ndarray) -> tuple[float, float, float]:
 def _linear_of_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
     ramp = np.clip(np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
     return (value * (1 - saturation + saturation * ramp)) ** 2.2  # the display curve, near enough for a random color
-
-
-def _decal(place: list[tuple[float, float, float]], half: np.ndarray, bitmap: np.ndarray, oval=False) -> pt.Decal:
-    center, right, up = place
-    return pt.Decal(center, right, up, (float(half[0]), float(half[1])), bitmap.astype(np.float32), oval)
 
 
 class _Draw:
@@ -111,22 +102,23 @@ class _Draw:
         cycles = np.exp(self.u(np.log(low), np.log(high)))
         return np.ascontiguousarray((cycles * np.array([1.0, 1.0, 1.0 / stretch]))[:, None] * axes)
 
-    def blotches(self, frame: np.ndarray, level: tuple, softness: tuple, **options) -> pt.Blotches:
-        """level, softness: ranges."""
-        return pt.Blotches(frame, self.seed(), self.u(*level), self.u(*softness), **options)
+    def blotches(self, frame: np.ndarray, threshold: tuple, softness: tuple, **options) -> SurfaceFunction:
+        """threshold, softness: ranges."""
+        seed = self.seed()
+        return pt.blotches(frame, self.u(*threshold), self.u(*softness), seed=seed, **options)
 
-    def bump(self, frame: np.ndarray, low: float, high: float) -> pt.Emboss:
+    def bump(self, frame: np.ndarray, low: float, high: float) -> SurfaceFunction:
         """Stretched noise of ``low`` to ``high`` steepness."""
-        return pt.Emboss(frame, self.seed(), self.u(low, high) / float(np.linalg.norm(frame[0])), octaves=1)
+        return pt.emboss(frame, self.seed(), self.u(low, high) / float(np.linalg.norm(frame[0])), octaves=1)
 
-    def noise(self, low: float, high: float, steepness: float) -> pt.Emboss:
+    def noise(self, low: float, high: float, steepness: float) -> SurfaceFunction:
         frame = self.frame(low, high)
-        return pt.Emboss(frame, self.seed(), steepness / float(np.linalg.norm(frame[0])), octaves=2)
+        return pt.emboss(frame, self.seed(), steepness / float(np.linalg.norm(frame[0])), octaves=2)
 
     def material(self, role: str, box: np.ndarray) -> Material:
         u, color, chance = self.u, self.color, self.chance
         layers: list[Layer] = []
-        bumps: list[Bump] = []
+        bumps: list[SurfaceFunction] = []
         match role:
             case "wood":
                 return self.wood(box)
@@ -136,8 +128,8 @@ class _Draw:
                 base = Coat(color("any"), u(0.7, 1.0))
                 if chance(0.6):
                     thread = self.frame(20, 70, turned=0.1)
-                    layers.append((Coat(self.near(base.color, 0.35), base.roughness), pt.Weave(thread)))
-                    bumps.append(pt.Weave(thread, float(u(0.1, 0.35) / np.linalg.norm(thread[0]))))
+                    layers.append((Coat(self.near(base.color, 0.35), base.roughness), pt.weave(thread)))
+                    bumps.append(pt.weave_bump(thread, float(u(0.1, 0.35) / np.linalg.norm(thread[0]))))
                 else:
                     bumps.append(self.noise(15, 50, u(0.04, 0.15)))
             case "leather":
@@ -146,8 +138,8 @@ class _Draw:
                 skin = self.frame(18, 50)
                 creases = Coat(self.near(base.color, 0.3), min(base.roughness + 0.15, 1.0))
                 seed = self.seed()
-                layers.append((creases, pt.Mosaic(skin, seed, border=0.12)))
-                bumps.append(pt.Emboss(skin, seed, float(u(0.15, 0.4) / np.linalg.norm(skin[0])), cellular=True))
+                layers.append((creases, pt.mosaic(skin, seed, border=0.12)))
+                bumps.append(pt.emboss(skin, seed, float(u(0.15, 0.4) / np.linalg.norm(skin[0])), cellular=True))
             case "ceramic":
                 base = Coat(color("white" if chance(0.4) else "any"), self.roughness(0.12, 0.5))
             case "stone":
@@ -156,15 +148,14 @@ class _Draw:
                 base = Coat(color(self.pick("earth wood gray white muted vivid")), u(0.45, 0.9))
                 if chance(0.5):
                     frame, mosaic = self.frame(3, 12), chance(0.4)
-                    spots: pt.Mosaic | pt.Blotches = (
-                        pt.Mosaic(frame, self.seed(), fraction=u(0.2, 0.6))
-                        if mosaic
-                        else self.blotches(frame, (-0.2, 0.4), (0.03, 0.2))
-                    )
+                    if mosaic:
+                        spots = pt.mosaic(frame, self.seed(), fraction=u(0.2, 0.6))
+                    else:
+                        spots = self.blotches(frame, (-0.2, 0.4), (0.03, 0.2))
                     layers.append((Coat(color("any"), base.roughness), spots))
                 if chance(0.4):
                     belly = Coat(color("white" if chance(0.5) else "earth"), base.roughness)
-                    layers.append((belly, pt.Facing((0, -1, 0), -0.2, 0.5, self.seed())))
+                    layers.append((belly, pt.facing((0, -1, 0), -0.2, 0.5, self.seed())))
                 if chance(0.5):
                     bumps.append(self.noise(10, 40, u(0.02, 0.12)))
             case "rubber":
@@ -190,29 +181,28 @@ class _Draw:
         size = float(np.max(box[1] - box[0]))
         layers: list[Layer] = []
         if self.chance(chance):
-            pattern: Pattern
             match int(rng.choice(7, p=[0.25, 0.08, 0.1, 0.17, 0.2, 0.1, 0.1])):
                 case 0:
                     frame = self.frame(min(1.5 / size, 10), 14, turned=0.15)
                     if self.chance(0.5):
                         frame = frame[[int(np.argmax(np.abs(frame[:, 1]))), 0, 1]]  # horizontal bands
-                    pattern = pt.Bands(frame, u(0.15, 0.7), u(), u(0, 0.5) * self.chance(0.25), self.seed())
+                    pattern = pt.bands(frame, u(0.15, 0.7), u(), u(0, 0.5) * self.chance(0.25), self.seed())
                 case 1:
-                    pattern = pt.Checker(self.frame(3, 14, turned=0.1))
+                    pattern = pt.checker(self.frame(3, 14, turned=0.1))
                 case 2:
-                    pattern = pt.Dots(self.frame(4, 16, turned=0.2), u(0.15, 0.4))
+                    pattern = pt.dots(self.frame(4, 16, turned=0.2), u(0.15, 0.4))
                 case 3:
-                    frame = self.frame(2, 9)
-                    pattern = pt.Blotches(frame, self.seed(), u(-0.3, 0.5), u(0.02, 0.4), gain=u(0.35, 0.65))
+                    frame, seed = self.frame(2, 9), self.seed()
+                    pattern = pt.blotches(frame, u(-0.3, 0.5), u(0.02, 0.4), gain=u(0.35, 0.65), seed=seed)
                 case 4:
                     axis = np.eye(3)[1 if self.chance(0.7) else int(rng.choice([0, 2]))] * rng.choice([-1, 1])
                     at = float(box.mean(0) @ axis) + u(-0.3, 0.3) * size
                     soft = u(0.002, 0.01) if self.chance(0.5) else u(0.05, 0.4)
-                    pattern = pt.Ramp(tuple(axis.tolist()), at - soft, at + soft, 0.0, 0)
+                    pattern = pt.ramp(tuple(axis.tolist()), at - soft, at + soft, 0.0, 0)
                 case 5:
-                    pattern = pt.Mosaic(self.frame(4, 14), self.seed(), border=u(0.05, 0.2))
+                    pattern = pt.mosaic(self.frame(4, 14), self.seed(), border=u(0.05, 0.2))
                 case _:
-                    pattern = pt.Mosaic(self.frame(4, 16), self.seed(), fraction=u(0.1, 0.6))
+                    pattern = pt.mosaic(self.frame(4, 16), self.seed(), fraction=u(0.1, 0.6))
             layers.append((second, pattern))
         return layers + self.label(box) if self.chance(0.8 * chance) else layers
 
@@ -226,21 +216,21 @@ class _Draw:
         half = 0.5 * np.abs([extent @ right, extent @ up]) * u(0.25, 0.85, 2)
         center = box.mean(0) + right * u(-0.3, 0.3) * (np.abs(extent @ right) / 2 - half[0])
         center = center + up * u(-0.6, 0.6) * (np.abs(extent @ up) / 2 - half[1])
-        place = [(float(x), float(y), float(z)) for x, y, z in (center, right, up)]
+        place = np.stack([center, right, up])
         paper = Coat(self.color(self.pick("white vivid any")), u(0.3, 0.8))
         plain = "dark" if sum(paper.color) > 1.0 else "white"
         ink = Coat(self.color(plain if self.chance(0.6) else "vivid"), paper.roughness)
         layers: list[Layer] = []
         oval = self.chance(0.2)
         if self.chance(0.75):
-            layers.append((paper, _decal(place, half, np.ones((1, 1)), oval)))
+            layers.append((paper, pt.decal(place, half, np.ones((1, 1)), oval)))
         if self.chance(0.3):
             side = rng.random((9, 5)) < 0.55
             bitmap = np.concatenate([side, side[:, -2::-1]], 1)
             inner = np.full(2, 0.7 * half.min())
         else:
             bitmap, inner = self.text(int(rng.integers(1, 6)), int(rng.integers(3, 10))), half * 0.85
-        return [*layers, (ink, _decal(place, inner, bitmap))]
+        return [*layers, (ink, pt.decal(place, inner, bitmap))]
 
     def text(self, rows: int, columns: int) -> np.ndarray:
         """Bitmap of rows of random glyphs of 5 by 3 blocks, each with a stem, which resemble print."""
@@ -256,7 +246,7 @@ class _Draw:
         rgb = self.near((0.1, 0.075, 0.05), 0.4) if self.chance(0.6) else self.near(base.color, 0.5)
         dirt = Coat(rgb, float(np.clip(base.roughness + self.u(0, 0.3), 0.1, 1)))
         if self.chance(0.5):
-            return dirt, pt.Ramp((0.0, -1.0, 0.0), self.u(0.1, 0.4), self.u(0.5, 0.8), 0.3, self.seed())
+            return dirt, pt.ramp((0.0, -1.0, 0.0), self.u(0.1, 0.4), self.u(0.5, 0.8), 0.3, self.seed())
         return dirt, self.blotches(self.frame(2, 7), (0.35, 0.9), (0.2, 0.5))
 
     def wear(self) -> Layer:
@@ -264,7 +254,8 @@ class _Draw:
         below = Coat(self.color(self.pick("wood gray earth")), self.u(0.5, 0.95))
         if self.chance(0.35):
             scratch = self.frame(4, 10, stretch=6.0, turned=0.7)
-            return below, pt.Blotches(scratch, self.seed(), self.u(0.4, 0.48), 0.03, octaves=2, ridged=True)
+            seed = self.seed()
+            return below, pt.blotches(scratch, self.u(0.4, 0.48), 0.03, ridged=True, octaves=2, seed=seed)
         return below, self.blotches(self.frame(3, 9), (0.4, 1.0), (0.02, 0.15), octaves=5, gain=0.6)
 
     def wood(self, box: np.ndarray) -> Material:
@@ -272,7 +263,7 @@ class _Draw:
         longest = int(np.argmax(box[1] - box[0])) if self.chance(0.8) else int(self.rng.integers(3))
         axes = np.roll(np.eye(3), longest + 1, axis=1)  # the third pattern axis runs along the longest side
         frame = u(1.5, 4.0) * axes
-        grain = pt.Grain(frame, self.seed(), u(3, 9), tuple(u(0.5, 4.0, 2).tolist()))
+        grain = pt.grain(frame, self.seed(), u(3, 9), tuple(u(0.5, 4.0, 2).tolist()))
         varnish = self.roughness(0.25, 0.85)
         late = _rgb(np.array(rgb) * u(0.3, 0.75) ** np.array([0.85, 1.0, 1.15]))
         layers: list[Layer] = [(Coat(late, min(varnish + 0.08, 1.0)), grain)]
@@ -290,7 +281,7 @@ class _Draw:
         rgb = self.near(METALS[int(rng.choice(len(METALS), p=METAL_WEIGHTS))], 0.08)
         base = Coat(rgb, self.roughness(0.15, 0.6), 1.0)
         layers: list[Layer] = []
-        bumps: list[Bump] = []
+        bumps: list[SurfaceFunction] = []
         kind = rng.random()
         if kind < 0.25:  # rust or verdigris
             rust = self.near((0.22, 0.075, 0.03) if self.chance(0.75) else (0.16, 0.3, 0.24), 0.3)
@@ -301,7 +292,7 @@ class _Draw:
             frame = self.frame(60, 120, stretch=30.0, turned=0.05)
             bumps.append(self.bump(frame, 0.05, 0.16))
             coat = Coat(self.near(rgb, 0.15), min(base.roughness + 0.1, 1.0), 1.0)
-            layers.append((coat, pt.Blotches(frame, self.seed(), 0.1, 0.5, octaves=1)))
+            layers.append((coat, pt.blotches(frame, 0.1, 0.5, seed=self.seed(), octaves=1)))
         elif kind < 0.65:  # hammered or cast
             bumps.append(self.noise(6, 20, u(0.05, 0.18)))
         elif kind < 0.85:  # painted, worn to the metal
@@ -318,17 +309,16 @@ class _Draw:
         base = Coat(self.color(self.pick("gray white earth dark muted")), self.roughness(0.3, 0.95))
         other = Coat(self.near(base.color, 0.7) if self.chance(0.7) else self.color("any"), base.roughness)
         kind = self.rng.random()
-        spots: pt.Blotches | pt.Mosaic
         if kind < 0.45:
             frame = self.frame(1.5, 5, stretch=u(1, 3), turned=1.0)
             spots = self.blotches(frame, (0.0, 0.35), (0.05, 0.3), octaves=5, ridged=True)
         elif kind < 0.75:
             spots = self.blotches(self.frame(4, 20), (-0.2, 0.4), (0.1, 0.5), octaves=5, gain=0.65)
         else:
-            spots = pt.Mosaic(self.frame(10, 30), self.seed(), fraction=u(0.2, 0.5))
+            spots = pt.mosaic(self.frame(10, 30), self.seed(), fraction=u(0.2, 0.5))
         layers: list[Layer] = [(other, spots)]
         bumps = (self.noise(8, 30, u(0.02, 0.16)),) if self.chance(0.6) else ()
         if self.chance(0.3):
             moss = Coat(self.near((0.12, 0.16, 0.05), 0.4), 0.95)
-            layers.append((moss, pt.Facing((0, 1, 0), 0.3, 0.9, self.seed())))
+            layers.append((moss, pt.facing((0, 1, 0), 0.3, 0.9, self.seed())))
         return Material(base, tuple(layers), bumps, u(0.03, 0.2), u(0, 0.08), u(2, 8), self.seed())

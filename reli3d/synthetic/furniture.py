@@ -3,6 +3,8 @@
 Lengths are in meters, approximately; the floor is at y = 0 and the front faces +z.  ``manmade.py`` defines a family.
 """
 
+import itertools
+
 import numpy as np
 
 from reli3d.synthetic import primitives as p
@@ -30,10 +32,9 @@ def _legs(a: Assembly, part: int, w: float, d: float, h: float, *, thick: float)
     rng = a.rng
     style, splay = int(rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])), rng.uniform(0, 0.18) * (rng.random() < 0.4)
     x, z = w / 2 - thick * 0.7, d / 2 - thick * 0.7
-    for sx in (-1, 1):
-        for sz in (-1, 1):
-            foot = np.array([sx * (x + splay * h), 0.0, sz * (z + splay * h)])
-            _leg(a, part, foot, np.array([sx * x, h, sz * z]), thick, style)
+    for sx, sz in itertools.product((-1, 1), (-1, 1)):
+        foot = np.array([sx * (x + splay * h), 0.0, sz * (z + splay * h)])
+        _leg(a, part, foot, np.array([sx * x, h, sz * z]), thick, style)
     if rng.random() < 0.5:
         y, t = rng.uniform(0.15, 0.5) * h, thick * 0.55
         out = splay * (h - y)
@@ -50,8 +51,7 @@ def table(a: Assembly) -> None:
     top = wood if rng.random() < 0.6 else a.random_part("wood", "stone", "plastic", "leather", "fabric")
     h, w, d, t = u(0.4, 0.95), u(0.45, 1.7), u(0.4, 0.9), u(0.02, 0.07)
     if rng.random() < 0.35:  # stool
-        w, d = u(0.28, 0.5), u(0.28, 0.5)
-        t = u(0.02, 0.1)
+        w, d, t = u(0.28, 0.5), u(0.28, 0.5), u(0.02, 0.1)
     rounded = rng.random() < 0.3
     if rounded:
         d = w = min(w, 1.0)
@@ -88,9 +88,7 @@ def table(a: Assembly) -> None:
 
 
 def chair(a: Assembly) -> None:
-    """Chair: legs, seat with or without cushion, back of posts with slats, bars or a panel, arms; or a plastic
-    shell.
-    """
+    """Chair: legs, seat with or without cushion, back of posts with slats, bars or a panel, arms; or a shell."""
     rng, u = a.rng, a.rng.uniform
     wood = a.random_part("wood", "metal", "plastic", "paint", p=[0.55, 0.15, 0.15, 0.15])
     soft = a.random_part("fabric", "leather") if rng.random() < 0.5 else wood
@@ -113,8 +111,7 @@ def chair(a: Assembly) -> None:
         for s in np.linspace(-0.75, 0.75, int(rng.integers(3, 8))):
             a.add(p.tube([at(s, 0), at(s, back)], 0.011, segments=8), wood)
     else:
-        high = back * u(0.45, 0.8)
-        bevel = u(0.01, 0.03)
+        high, bevel = back * u(0.45, 0.8), u(0.01, 0.03)
         panel = p.box((w * 0.98, high, u(0.03, 0.09)), bevel).rotate((-np.degrees(np.arctan(lean)), 0, 0))
         a.add(panel, soft, at(0, back - high / 2 + 0.02))
     if rng.random() < 0.35:
@@ -167,13 +164,12 @@ def _drawers(a: Assembly, w: float, h: float, d: float, at: np.ndarray, part: in
     knob = a.part("metal" if rng.random() < 0.6 else "wood")
     front = part if rng.random() < 0.6 else a.part("paint" if rng.random() < 0.5 else "wood")
     bar = rng.random() < 0.4
-    for i in range(rows):
-        for j in range(columns):
-            x, y = ((j + 0.5) / columns - 0.5) * w, ((i + 0.5) / rows - 0.5) * h
-            size = np.array([w / columns * 0.92, h / rows * 0.88])
-            a.add(p.box((*size, 0.04), 0.008), front, at + (x, y, d / 2))
-            grip = p.box((0.3 * size[0], 0.015, 0.05), 0.005) if bar else p.ellipsoid((0.022, 0.022, 0.025), 16)
-            a.add(grip, knob, at + (x, y + 0.1 * size[1], d / 2 + 0.04))
+    wide, tall = w / columns * 0.92, h / rows * 0.88
+    grip = p.box((0.3 * wide, 0.015, 0.05), 0.005) if bar else p.ellipsoid((0.022, 0.022, 0.025), 16)
+    for i, j in itertools.product(range(rows), range(columns)):
+        x, y = ((j + 0.5) / columns - 0.5) * w, ((i + 0.5) / rows - 0.5) * h
+        a.add(p.box((wide, tall, 0.04), 0.008), front, at + (x, y, d / 2))
+        a.add(grip, knob, at + (x, y + 0.1 * tall, d / 2 + 0.04))
 
 
 def shelf(a: Assembly) -> None:
@@ -210,16 +206,13 @@ def shelf(a: Assembly) -> None:
 
 
 def vehicle(a: Assembly) -> None:
-    """Toy car, truck, cart or train: body and cabin of rounded or wedge-like blocks, wheels with hubs, bumpers,
-    lamps.
-    """
+    """Toy car, truck, cart or train: body and cabin of rounded or wedge-like blocks, wheels, bumpers, lamps."""
     rng, u = a.rng, a.rng.uniform
     paint, tire = a.part("paint"), a.part("rubber")
     hub, dark = a.part("metal"), a.part("accent")
     long, w, h, r = u(0.9, 1.6), u(0.4, 0.65), u(0.14, 0.34), u(0.1, 0.2)
     a.add(p.box((long, h, w), float(rng.choice([0.01, 0.04, 0.1]))), paint, (0, r + h / 2, 0))
-    cabin, x = u(0.25, 0.6) * long, u(-0.2, 0.2) * long
-    tall = u(0.18, 0.4)
+    cabin, x, tall = u(0.25, 0.6) * long, u(-0.2, 0.2) * long, u(0.18, 0.4)
     top = p.wedge((cabin, tall, w * 0.9), u(0.5, 1.0), u(-0.1, 0.1))
     a.add(top, paint if rng.random() < 0.4 else dark, (x, r + h + tall / 2 - 0.01, 0))
     a.add(p.box((cabin * 0.6, 0.04, w * 0.88), 0.015), paint, (x, r + h + tall, 0))

@@ -1,8 +1,9 @@
 """Families of man-made objects: primitives with booleans, devices, tools, extruded outlines.
 
-A family is a function ``family(assembly)`` that draws from ``assembly.rng`` and adds solids, +Y up, of sizes of the
-order of 1.  Proportions are typical: legs a few percent of the height, walls 2 to 6 %, edges rounded by 0 to 10 %.
+A family is a function ``family(assembly)`` that draws from ``assembly.rng`` and adds solids, +Y up, of about size 1.
 """
+
+import itertools
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
@@ -134,9 +135,8 @@ def device(a: Assembly) -> None:
         key = p.cylinder(size / 2, 0.06, bevel=0.01, segments=16).rotate((90, 0, 0))
         if rng.random() < 0.6:
             key = p.box((size, size, 0.06), 0.15 * size)
-        for i in range(rows):
-            for j in range(cols):
-                a.add(key, keys, ((j - (cols - 1) / 2) * size * 1.25, low + i * size * 1.25, front))
+        for i, j in itertools.product(range(rows), range(cols)):
+            a.add(key, keys, ((j - (cols - 1) / 2) * size * 1.25, low + i * size * 1.25, front))
     for _ in range(int(rng.integers(0, 4))):  # knobs on top or front
         r, tall = u(0.03, 0.1) * w, u(0.04, 0.14)
         knob = p.cylinder(r, tall, top=r * u(0.8, 1), bevel=0.01, segments=20)
@@ -169,9 +169,8 @@ def tool(a: Assembly) -> None:
         a.add(p.box((u(0.3, 0.5), u(0.12, 0.2), u(0.12, 0.18)), 0.03), head, (u(-0.08, 0.08), tall, 0))
         a.add(p.cylinder(u(0.07, 0.11), 0.12, bevel=0.015).rotate((0, 0, 90)), head, (0.25, tall, 0))
     elif kind == 1:  # axe or spade
-        outline = np.array(
-            [[0, 0.09], [u(0.25, 0.45), u(0.15, 0.3)], [u(0.3, 0.48), 0], [u(0.25, 0.45), -u(0.15, 0.3)], [0, -0.09]]
-        )
+        upper, tip, lower = (u(0.25, 0.45), u(0.15, 0.3)), (u(0.3, 0.48), 0), (u(0.25, 0.45), -u(0.15, 0.3))
+        outline = np.array([(0, 0.09), upper, tip, lower, (0, -0.09)])
         a.add(p.prism(outline, u(0.04, 0.09), bevel=0.012).rotate((90, 0, 0)), head, (0, tall * 0.92, 0))
         a.add(p.box((0.16, 0.2, 0.12), 0.02), head, (0, tall * 0.92, 0))
     elif kind == 2:  # blade with guard
@@ -221,8 +220,7 @@ def profile(a: Assembly) -> None:
         a.cut(p.cylinder(hole, 2), part)
         if rng.random() < 0.5:
             count = int(rng.integers(3, 8))
-            for k in range(count):
-                t = 2 * np.pi * k / count
+            for t in 2 * np.pi * np.arange(count) / count:
                 a.cut(p.cylinder(0.06, 2, segments=20), part, (0.31 * np.cos(t), 0, 0.31 * np.sin(t)))
         if rng.random() < 0.7:
             a.transform(ON_BACK)

@@ -37,6 +37,9 @@ def load_maps(path: Path) -> tuple[Tensor, list[str]]:
     if len(names) != len(env):
         raise InputError(path, f"names: expected {len(env)}, one a map, got {len(names)}")
     maps = torch.as_tensor(env.astype(np.float32)).permute(0, 3, 1, 2)
+    bad = [name for name, light in zip(names, maps) if not bool(((light >= 0) & light.isfinite()).all())]
+    if bad:
+        raise InputError(path, f"env: expected finite radiance of at least 0, got others in {', '.join(bad[:3])}")
     maps = torch.nn.functional.interpolate(maps, (ROWS, 2 * ROWS), mode="area").permute(0, 2, 3, 1)
     return quarter_turn(maps, -1).contiguous(), names  # the file has -Z at the horizontal center
 
@@ -61,15 +64,13 @@ def with_lamps(light: Tensor, rng: np.random.Generator) -> Tensor:
     total = float((light.mean(-1, keepdim=True) * area).sum())
     out = light.clone()
     for _ in range(int(rng.integers(1, 4))):
-        y = rng.uniform(-0.15, 0.98)
-        angle = rng.uniform(0, 2 * np.pi)
+        y, angle = rng.uniform(-0.15, 0.98), rng.uniform(0, 2 * np.pi)
         horizontal = np.sqrt(1 - y * y)
         to = torch.tensor([horizontal * np.cos(angle), y, horizontal * np.sin(angle)], dtype=torch.float32)
         radius = np.radians(np.exp(rng.uniform(np.log(2.0), np.log(18.0))))
         away = (directions @ to).clamp(-1, 1).acos()
         disk = torch.sigmoid((radius - away) / (0.15 * radius + np.pi / rows / 2))[..., None]
-        warmth = rng.normal(0, 0.25)
-        tint = torch.tensor([np.exp(warmth), 1.0, np.exp(-warmth)], dtype=torch.float32)
+        tint = torch.tensor(np.exp(rng.normal(0, 0.25) * np.array([1, 0, -1])), dtype=torch.float32)
         flux = total * np.exp(rng.uniform(np.log(0.15), np.log(1.5)))
         out += disk * tint * (flux / float((disk * area).sum()))
     return out

@@ -1,11 +1,7 @@
-"""Spatially varying materials: layers of uniform material, blended by solid patterns, with bumps.
+"""Layers of uniform material, blended by solid patterns, with bumps; colors linear Rec. 709, roughness perceptual."""
 
-Base colors are linear Rec. 709, 0.02 to 0.9; roughness is perceptual.
-"""
-
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -27,17 +23,8 @@ class Coat:
     metallic: float = 0.0
 
 
-class Pattern(Protocol):
-    def weight(self, points: Tensor, normals: Tensor) -> Tensor:
-        """Blend weight ``(N,)`` in [0, 1] of a layer at surface points and normals ``(N, 3)``."""
-
-
-class Bump(Protocol):
-    def height_gradient(self, points: Tensor, normals: Tensor) -> Tensor:
-        """Gradient ``(N, 3)`` of a height field at surface points and normals ``(N, 3)``."""
-
-
-Layer = tuple[Coat, Pattern]
+SurfaceFunction = Callable[[Tensor, Tensor], Tensor]  # of points and normals (N, 3), see :mod:`.patterns`
+Layer = tuple[Coat, SurfaceFunction]  # and its blend weight
 
 
 @dataclass(frozen=True)
@@ -46,7 +33,7 @@ class Material:
 
     base: Coat
     layers: tuple[Layer, ...] = ()
-    bumps: tuple[Bump, ...] = ()
+    bumps: tuple[SurfaceFunction, ...] = ()  # gradients of height fields
     drift: float = 0.0  # relative standard deviation of the color, by low-frequency noise
     drift_roughness: float = 0.0  # standard deviation of the roughness
     drift_scale: float = 3.0  # cycles per unit
@@ -54,11 +41,10 @@ class Material:
 
     def at(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Base color ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)`` and bump-mapped normal ``(N, 3)``."""
-        coat = points.new_tensor([*self.base.color, self.base.roughness, self.base.metallic])
-        value = coat.expand(len(points), 5)
-        for layer, pattern in self.layers:
-            other = points.new_tensor([*layer.color, layer.roughness, layer.metallic])
-            value = torch.lerp(value, other.expand_as(value), pattern.weight(points, normals)[:, None])
+        row = lambda coat: points.new_tensor([*coat.color, coat.roughness, coat.metallic]).expand(len(points), 5)  # noqa: E731
+        value = row(self.base)
+        for coat, weight in self.layers:
+            value = torch.lerp(value, row(coat), weight(points, normals)[:, None])
         color, roughness = value[:, :3], value[:, 3]
         if self.drift > 0 or self.drift_roughness > 0:
             noise = fbm(points * self.drift_scale, octaves=3, seed=self.seed)[0] * 2
@@ -66,7 +52,7 @@ class Material:
             roughness = roughness + self.drift_roughness * noise
         bumped = normals
         if self.bumps:
-            gradient = torch.stack([bump.height_gradient(points, normals) for bump in self.bumps]).sum(0)
+            gradient = torch.stack([bump(points, normals) for bump in self.bumps]).sum(0)
             gradient = gradient - normals * (gradient * normals).sum(-1, keepdim=True)  # in the tangent plane
             size = gradient.norm(dim=-1, keepdim=True)
             limited = MAX_HEIGHT_GRADIENT * torch.tanh(size / MAX_HEIGHT_GRADIENT)
@@ -77,11 +63,7 @@ class Material:
 def evaluate(
     materials: Sequence[Material], points: Tensor, normals: Tensor, part: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Evaluates the materials at ``points (N, 3)`` with unit ``normals (N, 3)`` and material indices ``part (N,)``.
-
-    Returns base color ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)`` and bump-mapped normal ``(N, 3)``, float32.
-    Raises TypeError unless float32, ValueError for a wrong shape or index.
-    """
+    """Base color, roughness, metallic and bumped normal at ``points`` of material ``part``.  Raises ValueError."""
     check("points", points, shape=(len(part), 3))
     check("normals", normals, shape=(len(part), 3))
     if len(part) and not (int(part.min()) >= 0 and int(part.max()) < len(materials)):

@@ -12,8 +12,7 @@ def fbm(
     """Fractal sum of gradient noise at ``points (N, 3)``: value ``(N,)`` and its gradient ``(N, 3)`` in the points.
 
     One octave has mean 0 and standard deviation 0.5.  gain: amplitude ratio of successive octaves.  ridged: sums
-    absolute values (turbulence, Perlin 1985).  Not differentiable by autograd.  Raises TypeError unless float32,
-    ValueError for a wrong shape or ``octaves`` outside 1 to 16.
+    absolute values (turbulence, Perlin 1985).  Not differentiable by autograd.  Raises ValueError.
     """
     _bridge.check("points", points, shape=("N", 3))
     if not 1 <= octaves <= 16:

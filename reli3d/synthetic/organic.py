@@ -1,8 +1,4 @@
-"""Families of organic shapes: animals, figures, busts, fruits, shoes, stones.
-
-Each is a signed field on a grid, negative inside, whose zero iso-surface is extracted by surface nets (Gibson 1998):
-one vertex per cell that the surface crosses, at the mean of its edge crossings, and one quad per crossed grid edge.
-"""
+"""Families of organic shapes: iso-surfaces of signed fields, negative inside, by surface nets (Gibson 1998)."""
 
 from collections.abc import Sequence
 
@@ -33,8 +29,7 @@ class Field:
         line = end - start
         length = float(line @ line) + 1e-12
         margin = max(radius, tip) + blend * 2 + 2 * self.step
-        window = self._window(np.minimum(start, end), np.maximum(start, end), margin)
-        x, y, z = np.meshgrid(*[axis[s] for axis, s in zip(self.axes, window)], indexing="ij", sparse=True)
+        window, (x, y, z) = self._window(np.minimum(start, end), np.maximum(start, end), margin)
         t = np.clip(((x - start[0]) * line[0] + (y - start[1]) * line[1] + (z - start[2]) * line[2]) / length, 0, 1)
         d = (x - start[0] - t * line[0]) ** 2 + (y - start[1] - t * line[1]) ** 2 + (z - start[2] - t * line[2]) ** 2
         self._join(window, np.sqrt(d) - (radius + t * (tip - radius)), blend, label)
@@ -42,8 +37,7 @@ class Field:
     def ball(self, center, radii, *, blend: float = 0.05, label: int = 0) -> None:
         """Smooth union with an ellipsoid of half axes ``radii``."""
         center, radii = np.asarray(center, dtype=np.float32), np.broadcast_to(np.asarray(radii, dtype=np.float32), 3)
-        window = self._window(center - radii, center + radii, blend * 2 + 2 * self.step)
-        x, y, z = np.meshgrid(*[axis[s] for axis, s in zip(self.axes, window)], indexing="ij", sparse=True)
+        window, (x, y, z) = self._window(center - radii, center + radii, blend * 2 + 2 * self.step)
         x, y, z = ((v - c) / r for v, c, r in zip((x, y, z), center, radii))
         self._join(window, (np.sqrt(x**2 + y**2 + z**2) - 1) * float(radii.min()), blend, label)
 
@@ -58,9 +52,8 @@ class Field:
 
     def add_to(self, a: Assembly, parts: list[int]) -> None:
         """Adds the closed surface to ``a``; a face belongs to ``parts[label]`` of the primitive nearest to it."""
-        self.value[[0, 1, -2, -1]] = 1.0
-        self.value[:, [0, 1, -2, -1]] = 1.0
-        self.value[:, :, [0, 1, -2, -1]] = 1.0
+        border = [0, 1, -2, -1]
+        self.value[border] = self.value[:, border] = self.value[:, :, border] = 1.0
         vertices, faces = surface_nets(self.value)
         solid = p.from_arrays(vertices * self.step + self.low, faces).simplify(0.06 * self.step)
         mesh = solid.to_mesh()
@@ -72,7 +65,8 @@ class Field:
     def _window(self, low, high, margin):
         a = np.floor((low - margin - self.low) / self.step).astype(int).clip(0)
         b = np.ceil((high + margin - self.low) / self.step).astype(int) + 1
-        return tuple(slice(int(i), int(max(j, i + 1))) for i, j in zip(a, b))
+        window = tuple(slice(int(i), int(max(j, i + 1))) for i, j in zip(a, b))
+        return window, np.meshgrid(*[x[s] for x, s in zip(self.axes, window)], indexing="ij", sparse=True)
 
     def _join(self, window, value, blend, label):
         old = self.value[window]
@@ -82,9 +76,7 @@ class Field:
 
 
 def surface_nets(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices ``(V, 3)`` in grid units and outward triangles ``(F, 3)`` of the zero iso-surface of ``value``, negative
-    inside.
-    """
+    """Vertices ``(V, 3)`` in grid units and outward triangles ``(F, 3)`` of the zero iso-surface of ``value``."""
     inside = value < 0
     shape = np.array(value.shape) - 1
     quads, points = [], []

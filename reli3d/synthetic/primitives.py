@@ -1,8 +1,4 @@
-"""Primitive solids of procedural objects, +Y up.
-
-Every function returns a closed manifold3d solid.  Rounded boxes are convex hulls, bodies of revolution turn about +Y,
-tubes are swept with rotation-minimizing frames.  ``segments``: number of sides of a full circle.
-"""
+"""Closed manifold3d solids of procedural objects, +Y up.  ``segments``: number of sides of a full circle."""
 
 from collections.abc import Sequence
 
@@ -73,10 +69,7 @@ def torus(ring: float, tube: float, *, segments: int = 40) -> Manifold:
 
 
 def prism(outline: np.ndarray | Sequence[np.ndarray], height: float, *, bevel: float = 0.0) -> Manifold:
-    """Extrudes a polygon ``(K, 2)`` in x, z, or a list of contours, by ``height``, centered at the origin.
-
-    bevel: inset of the top and bottom rims.
-    """
+    """Extrudes a polygon ``(K, 2)`` in x, z, or contours, by ``height``, centered; ``bevel``: inset of the end rims."""
     contours = [outline] if isinstance(outline, np.ndarray) else list(outline)
     section = CrossSection([np.ascontiguousarray(c, dtype=float) for c in contours])
     body = Manifold.extrude(section, height).translate((0, 0, -height / 2))
@@ -98,11 +91,7 @@ def wedge(size: Sequence[float], ridge: float, shift: float = 0.0) -> Manifold:
 def tube(
     path: np.ndarray | Sequence, radius: np.ndarray | float, *, closed: bool = False, segments: int = 12
 ) -> Manifold:
-    """Sweeps a circle along ``path (K, 3)`` with ``radius`` at each point.
-
-    Frames are rotation minimizing (parallel transport, Hanson and Ma 1995); along a closed path the residual rotation
-    is distributed evenly.
-    """
+    """Sweeps a circle of ``radius`` along ``path (K, 3)``, with rotation-minimizing frames (Hanson and Ma 1995)."""
     path = np.asarray(path, dtype=float)
     count = len(path)
     tangent = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)

@@ -1,9 +1,6 @@
-"""Procedural objects for training: a closed mesh, its parts and their materials from one seed.
+"""Procedural objects for training: mesh, parts and materials from a seed; +Y up, centered, longest side 1."""
 
-The same seed gives the same object.  ``VALIDATION_SEEDS`` and ``TEST_SEEDS`` are disjoint.  Frame: right-handed,
-+Y up, centered, longest side 1, inside the sphere of radius 0.87 of the network's frame.
-"""
-
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,24 +21,12 @@ MIN_VOLUME_FRACTION = 2e-4  # volume over cubed longest side: a sword has 1e-3, 
 FRAME_RADIUS = 0.87  # half diagonal of the unit cube: contains objects of longest side 1
 
 FAMILIES = (
-    (manmade.csg, 0.2),
-    (vessels.vessel, 0.12),
-    (vessels.lamp, 0.05),
-    (manmade.device, 0.12),
-    (vessels.container, 0.08),
-    (manmade.tool, 0.05),
-    (manmade.profile, 0.05),
-    (furniture.table, 0.05),
-    (furniture.chair, 0.06),
-    (furniture.sofa, 0.03),
-    (furniture.shelf, 0.04),
-    (furniture.vehicle, 0.03),
-    (organic.creature, 0.045),
-    (organic.figure, 0.04),
-    (organic.shoe, 0.025),
-    (organic.fruit, 0.025),
+    (manmade.csg, 0.2), (vessels.vessel, 0.12), (vessels.lamp, 0.05), (manmade.device, 0.12),
+    (vessels.container, 0.08), (manmade.tool, 0.05), (manmade.profile, 0.05), (furniture.table, 0.05),
+    (furniture.chair, 0.06), (furniture.sofa, 0.03), (furniture.shelf, 0.04), (furniture.vehicle, 0.03),
+    (organic.creature, 0.045), (organic.figure, 0.04), (organic.shoe, 0.025), (organic.fruit, 0.025),
     (organic.stone, 0.035),
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -61,17 +46,15 @@ def make_object(seed: int) -> ProceduralObject:
     if seed < 0:
         raise ValueError(f"seed: expected at least 0, got {seed}")
     weights = np.array([w for _, w in FAMILIES])
-    attempt = 0
-    while True:  # a cut may leave nothing or a thin sheet: draw again from the next stream of the seed
-        rng = np.random.default_rng((seed, attempt))
-        family = FAMILIES[int(rng.choice(len(FAMILIES), p=weights / weights.sum()))][0]
-        assembly = Assembly(rng)
+    for attempt in itertools.count():  # a cut may leave nothing or a thin sheet: draw again from the next stream
+        assembly = Assembly(np.random.default_rng((seed, attempt)))
+        family = FAMILIES[int(assembly.rng.choice(len(FAMILIES), p=weights / weights.sum()))][0]
         family(assembly)
         if assembly.solid_fraction() > MIN_VOLUME_FRACTION:
-            _deform(assembly)
-            _pose(assembly)
-            return assemble(assembly, family.__name__)
-        attempt += 1
+            break
+    _deform(assembly)
+    _pose(assembly)
+    return assemble(assembly, family.__name__)
 
 
 def assemble(assembly: Assembly, name: str) -> ProceduralObject:
@@ -80,8 +63,7 @@ def assemble(assembly: Assembly, name: str) -> ProceduralObject:
     vertices = unit_size(vertices).astype(np.float32)
     used, part = np.unique(part, return_inverse=True)
     part = part.reshape(-1).astype(np.int32)
-    roles = [assembly.roles[k] for k in used]
-    materials = draw_materials(assembly.rng, roles, part_bounds(vertices, faces, part))
+    materials = draw_materials(assembly.rng, [assembly.roles[k] for k in used], part_bounds(vertices, faces, part))
     return ProceduralObject(vertices, faces, corner_normals(vertices, faces), part, materials, name)
 
 
@@ -100,8 +82,7 @@ def part_bounds(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> np
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = CREASE_DEG) -> np.ndarray:
     """Shading normals ``(F, 3, 3)`` float32 of the corners, smooth across dihedral angles below ``crease_deg``.
 
-    Corners of a vertex that are connected by smooth edges get the mean of their faces' normals, weighted by area, which
-    keeps flat faces next to narrow bevels flat, and by angle, which makes it independent of the triangulation.
+    Corners connected by smooth edges get the mean of their faces' normals, weighted by area and angle.
     """
     p = vertices[faces].astype(np.float64)
     edge = np.roll(p, -1, 1) - p
@@ -144,13 +125,14 @@ def _deform(a: Assembly) -> None:
 
     def move(q: np.ndarray) -> np.ndarray:
         r = (q - center) / size
+        x, y, z = r.T
         if kind == 0:
-            r = r * np.stack([1 + 0.7 * k * r[:, 1], np.ones(len(r)), 1 + 0.7 * k * r[:, 1]], -1)
+            r = np.stack([x * (1 + 0.7 * k * y), y, z * (1 + 0.7 * k * y)], -1)
         elif kind == 1:
-            c, s = np.cos(1.2 * k * r[:, 1]), np.sin(1.2 * k * r[:, 1])
-            r = np.stack([c * r[:, 0] + s * r[:, 2], r[:, 1], c * r[:, 2] - s * r[:, 0]], -1)
+            c, s = np.cos(1.2 * k * y), np.sin(1.2 * k * y)
+            r = np.stack([c * x + s * z, y, c * z - s * x], -1)
         elif kind == 2:
-            r = r + np.stack([0.35 * k * r[:, 1] ** 2, np.zeros(len(r)), np.zeros(len(r))], -1)
+            r = np.stack([x + 0.35 * k * y**2, y, z], -1)
         else:
             r = r + 0.025 * abs(k) * sum(np.sin(r @ w[:, None] + f) for w, f in zip(wave, phase))
         return r * size + center
@@ -176,9 +158,7 @@ def yaw_matrix(angle: float) -> np.ndarray:
 def sample_cameras(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world matrices ``(n, 4, 4)`` (OpenGL) and full fields of view ``(n,)`` in radians, float32.
 
-    Follows the rendering protocol of the paper.  Field of view: normal distribution of mean 29.5 and deviation 3.5
-    degrees, clipped to [22, 37].  Distance: 0.87 / sin(fov / 2) times 0.8 to 1.05.  Azimuths are stratified with jitter
-    and in random order.  One set in six covers only an arc.
+    By the paper's protocol.  Azimuths are stratified with jitter and in random order; one set in six covers an arc.
     """
     if n < 1:
         raise ValueError(f"n: expected at least 1, got {n}")

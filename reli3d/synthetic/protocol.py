@@ -1,11 +1,9 @@
 """Samples by the rendering protocol of the ReLi3D paper (its section B.1).
 
 The protocol: three environments per object, each rotated at random about the vertical axis; a field of view from a
-scaled normal distribution between 22 and 37 degrees; centered objects of unit scale; cameras that fill the frame with
-padding and a small shift; 100 images of objects with PBR ground truth, 30 of others.
-
-Not given in the paper: here the views of an object are divided among its environments, the normal distribution is cut
-at three standard deviations, and cameras are uniform over a zone of the sphere.
+scaled normal distribution between 22 and 37 degrees; centered objects of unit scale that fill the frame with padding
+and a small shift; 100 images of objects with PBR ground truth, 30 of others.  Not given in the paper: here the views
+are divided among the environments, the distribution is cut at three deviations, cameras are uniform over a zone.
 """
 
 import math
@@ -44,11 +42,7 @@ def fields_of_view(u: np.ndarray) -> np.ndarray:
 
 
 def framed_cameras(vertices: Tensor, rng: np.random.Generator, count: int, size: int) -> Camera:
-    """``count`` random cameras of ``size`` by ``size`` pixels that frame an object of unit scale at the origin.
-
-    vertices: ``(V, 3)`` of the object.  Each camera looks at the origin from the distance at which the object leaves
-    the padding free, and is then shifted.  The principal point is the image center.
-    """
+    """``count`` random cameras of ``size`` by ``size`` pixels that frame centered ``vertices (V, 3)``, then shifted."""
     fov = np.radians(fields_of_view(rng.random(count)))
     azimuth = rng.uniform(0.0, 2.0 * math.pi, count)
     low, high = (math.sin(math.radians(e)) for e in ELEVATION_DEG)
@@ -83,11 +77,7 @@ def lights_of(count: int, columns: int, rng: np.random.Generator) -> tuple[np.nd
 def protocol_sample(
     surface: Surface, maps: list[Tensor], seed: int, light: int, *, pbr: bool, size: int
 ) -> dict[str, Tensor]:
-    """The views of an object under its environment of index ``light``; a function of ``seed`` and ``light``.
-
-    maps: lat-long, ``(H, 2H, 3)`` linear.  pbr: whether the object has a ground-truth material; otherwise the sample
-    has only images, cameras and the environment.
-    """
+    """The views of an object under its environment ``light``; without ``pbr`` no ground-truth material."""
     chosen, turns = lights_of(len(maps), maps[0].shape[1], np.random.default_rng((seed, 2)))
     radiance = torch.roll(maps[chosen[light]], int(turns[light]), 1).contiguous()
     rng = np.random.default_rng((seed, 3, light))

@@ -1,8 +1,7 @@
 """Surfaces with randomly exchanged materials, so that a network cannot infer the material from the shape.
 
-The base color of most objects is multiplied by a random color.  The surface is divided into one to four regions with
-sharp borders.  Each region gets one of: its original material, its base color with another roughness and metallic
-value, a scanned material set by triplanar projection, or a procedural material.
+The base color of many objects is multiplied by a random color.  Each of one to four regions with sharp borders gets its
+original material, another roughness and metallic value, a scanned material set, or a procedural material.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,10 +38,7 @@ Region = Callable[[SurfacePoints], Tensor]
 
 
 def material_sets(folder: Path) -> tuple[Path, ...]:
-    """Folders of material sets inside ``folder``: basecolor, roughness, metallic and optionally normal, JPEG or PNG.
-
-    Raises InputError if there is none or if a map is missing.
-    """
+    """Folders in ``folder`` with basecolor, roughness, metallic and optionally normal, JPEG or PNG; or InputError."""
     found = sorted({path.parent for path in folder.glob("*/basecolor.*")})
     if not found:
         raise InputError(folder, "expected folders with basecolor, roughness, metallic and normal, got none")
@@ -60,19 +56,15 @@ def _map_file(folder: Path, name: str) -> Path:
 def _read_set(folder: Path, side: int) -> tuple[Tensor, Tensor, Tensor]:
     """Linear base color, (roughness, metallic, 0), tangent-space normal (OpenGL) of a set, each ``(side, side, 3)``."""
 
-    def read(name: str, mode: str) -> Tensor:
+    def read(name: str, mode: str, change: Callable[[Tensor], Tensor] = lambda values: values) -> Tensor:
         with Image.open(_map_file(folder, name)) as image:
-            values = torch.from_numpy(np.array(image.convert(mode), dtype=np.float32) / 255)
-        return values if values.ndim == 3 else values[..., None]
-
-    def resized(values: Tensor) -> Tensor:
-        chw = values.permute(2, 0, 1)[None]
+            values = np.atleast_3d(np.array(image.convert(mode), dtype=np.float32) / 255)
+        chw = change(torch.from_numpy(values)).permute(2, 0, 1)[None]
         return functional.interpolate(chw, (side, side), mode="area")[0].permute(1, 2, 0).contiguous()
 
-    base = resized(srgb_to_linear(read("basecolor", "RGB")))
-    rough, metal = resized(read("roughness", "L")), resized(read("metallic", "L"))
+    base, rough, metal = read("basecolor", "RGB", srgb_to_linear), read("roughness", "L"), read("metallic", "L")
     if _map_file(folder, "normal").exists():
-        normal = resized(read("normal", "RGB") * 2 - 1)
+        normal = read("normal", "RGB", lambda values: values * 2 - 1)
     else:
         normal = torch.tensor([0.0, 0.0, 1.0]).expand(side, side, 3).contiguous()
     return base, torch.cat([rough, metal, torch.zeros_like(rough)], -1), functional.normalize(normal, dim=-1)
@@ -81,13 +73,12 @@ def _read_set(folder: Path, side: int) -> tuple[Tensor, Tensor, Tensor]:
 class RefinishedSurface:
     """``base`` with random materials and base colors: a ``Surface`` of :mod:`reli3d.synthetic.samples`.
 
-    sets: from :func:`material_sets`.  measured: whether roughness and metallic of ``base`` are ground truth rather than
-    placeholders.  texels: resolution of a material set per unit of length, about two per pixel of a view.
+    measured: whether the finish of ``base`` is ground truth.  texels: of a material set per unit of length.
     """
 
     def __init__(self, base: Surface, sets: Sequence[Path], rng: np.random.Generator, *, measured: bool, texels: int):
         self.base, self.vertices, self.faces, self.scene = base, base.vertices, base.faces, base.scene
-        self.outer = base.outer
+        self.outer, self.distance = base.outer, base.distance
         kept = rng.random() < UNCHANGED_PROBABILITY
         count = 1 if kept else 1 + int(rng.choice(len(REGION_COUNTS), p=REGION_COUNTS))
         self._region = _draw_region(base, rng, count) if count > 1 else None
@@ -95,9 +86,6 @@ class RefinishedSurface:
         self._finishes = [_draw_finish(sets, rng, kind, measured=measured, texels=texels) for _ in range(count)]
         log = rng.normal(0, GAIN_DEVIATION) + rng.normal(0, HUE_DEVIATION, 3)
         self._gain = torch.as_tensor(np.exp(log * (rng.random() < RECOLORED_PROBABILITY)), dtype=torch.float32)
-
-    def distance(self, points: Tensor) -> Tensor:
-        return self.base.distance(points)
 
     def points_at(self, face: Tensor, bary: Tensor) -> SurfacePoints:
         original = self.base.points_at(face, bary)
@@ -126,8 +114,8 @@ def _draw_region(base: Surface, rng: np.random.Generator, count: int) -> Region:
 
     def by_cuts(p: SurfacePoints) -> Tensor:
         region = torch.zeros(len(p), dtype=torch.long)
-        for k, cut in enumerate(cuts):
-            region[cut(p.position)] = k + 1
+        for k, cut in enumerate(cuts, 1):
+            region[cut(p.position)] = k
         return region
 
     return by_cuts
@@ -171,8 +159,7 @@ def _draw_finish(
         return _set_finish(sets[int(rng.integers(len(sets)))], rng, texels)
     if kind == "procedural":
         role = str(rng.choice(ROLES))
-        box = np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]])
-        (material,) = draw_materials(rng, [role], box[None])
+        (material,) = draw_materials(rng, [role], np.full((1, 2, 3), 0.5) * [[-1], [1]])
         names = ("base_color", "roughness", "metallic", "normal")
         return lambda p: replace(p, **dict(zip(names, material.at(p.position, p.normal))))
     if kind == "keep" and measured:

@@ -1,8 +1,7 @@
 """Training samples: an object under one environment, rendered in several views, with ground truth at points.
 
-A sample is a dictionary of tensors, stored as one safetensors file.  ``docs/model.md``, "A sample", lists its entries
-with shapes and units.  It has ``V`` views of ``S`` by ``S`` pixels, cropped to the object.  World +Y up, object
-centered, longest side 1.  Radiance is scaled by the exposure of the first view.
+A sample is a dictionary of tensors, stored as one safetensors file; ``docs/model.md``, "A sample", lists its entries.
+World +Y up, object centered, longest side 1.  Radiance is scaled by the exposure of the first view.
 """
 
 from dataclasses import replace
@@ -45,10 +44,7 @@ def crop_camera(vertices: Tensor, c2w: Tensor, size: int, padding: float) -> Ten
 
 
 def enclosed(points: Tensor, scene: RayScene) -> Tensor:
-    """Whether all of SKY_DIRECTIONS rays from each of ``points (N, 3)`` hit ``scene``, ``(N,)`` bool.
-
-    Ray parity and winding numbers are unreliable for meshes with holes and internal faces.
-    """
+    """Whether all SKY_DIRECTIONS rays from each of ``points (N, 3)`` hit ``scene``, which may have holes, ``(N,)``."""
     z = 1 - (2 * torch.arange(SKY_DIRECTIONS) + 1) / SKY_DIRECTIONS
     phi = torch.arange(SKY_DIRECTIONS) * (np.pi * (3 - 5**0.5))
     radius = (1 - z * z).sqrt()
@@ -143,8 +139,7 @@ def synthesize(
 ) -> dict[str, Tensor]:
     """One sample of an object under the lat-long map ``light`` ``(H, 2H, 3)``, turned by a random yaw.
 
-    views_only: as in :func:`render_sample`.  finish_known: stored for each view, False if roughness and metallic of the
-    object are placeholders, as those of a scan are; training then leaves them out.
+    finish_known: stored for each view; False if roughness and metallic of the object are placeholders.
     """
     environment = Environment(torch.roll(light, int(rng.integers(light.shape[1])), 1).contiguous())
     c2w = torch.as_tensor(np.asarray(sample_cameras(rng, views)[0]), dtype=torch.float32)
@@ -162,7 +157,6 @@ def render_sample(
     """
     c2w, views, size = cameras.c2w, len(cameras.c2w), cameras.width
     fine = 1 if views_only else FINE
-    sample: dict[str, Tensor] = {}
     exposure, images, pixels, pixel_radiance = 0.0, [], [], []
     maps: dict[str, list[Tensor]] = {"view_material": [], "view_normal": [], "view_depth": []}
     for k in range(views):
@@ -171,7 +165,8 @@ def render_sample(
         if k == 0:
             bright = max(float(radiance.mean(-1).quantile(0.9)), 1e-3)
             exposure = EXPOSURE_TARGET / bright * float(np.exp(rng.normal(0, 0.25)))
-        alpha = _coverage(surface.scene, cameras[k], fine + 1)
+        hit = surface.scene.occluded(*camera_rays(cameras[k].scaled(fine + 1))).float()
+        alpha = functional.avg_pool2d(hit[None, None], fine + 1)[0, 0]  # antialiased
         image = pooled_pixels((image * exposure).clamp(0, 4), size, fine).clamp(0, 1)  # sensor saturation
         encoded = torch.cat([linear_to_srgb(image), alpha[..., None]], -1)
         images.append((encoded * 255 + 0.5).to(torch.uint8))
@@ -180,12 +175,11 @@ def render_sample(
         pick = torch.as_tensor(rng.integers(len(seen), size=PIXELS))
         pixels.append(torch.stack([points.position, points.normal, wo], 1)[pick])
         pixel_radiance.append((radiance[pick] * exposure).clamp(max=64.0))
-    sample.update(images=torch.stack(images), c2w=c2w, intrinsics=cameras.intrinsics)
-    sample.update({name: torch.stack(values) for name, values in maps.items()})
+    sample = {"images": torch.stack(images), "c2w": c2w, "intrinsics": cameras.intrinsics}
+    sample |= {name: torch.stack(values) for name, values in maps.items()}
     exposed = (environment.radiance * exposure).permute(2, 0, 1)[None]
-    pooled = functional.interpolate(exposed, (32, 64), mode="area")
-    # stored with -Z at the horizontal center, the format of samples since version 0.1
-    sample["environment"] = quarter_turn(pooled[0].permute(1, 2, 0), 1).clamp(max=6e4).half()
+    pooled = functional.interpolate(exposed, (32, 64), mode="area")[0].permute(1, 2, 0)
+    sample["environment"] = quarter_turn(pooled, 1).clamp(max=6e4).half()  # stored with -Z at the horizontal center
     if not views_only:
         sample.update(pixels=torch.stack(pixels).half(), pixel_radiance=torch.stack(pixel_radiance).half())
         sample.update(_volume(surface, rng), **_surface_points(surface, cameras, rng))
@@ -215,13 +209,6 @@ def pooled_pixels(rays: Tensor, size: int, fine: int = FINE) -> Tensor:
     """Means ``(S, S, C)`` over the ``fine**2`` rays of each pixel, of values ``(rays, C)``."""
     image = rays.reshape(1, size * fine, size * fine, -1).permute(0, 3, 1, 2)
     return functional.avg_pool2d(image, fine)[0].permute(1, 2, 0)
-
-
-def _coverage(scene: RayScene, camera: Camera, grid: int) -> Tensor:
-    """Antialiased alpha ``(S, S)``: fraction of ``grid**2`` subpixel rays that hit."""
-    origins, directions = camera_rays(camera.scaled(grid))
-    hit = scene.occluded(origins, directions).float()
-    return functional.avg_pool2d(hit[None, None], grid)[0, 0]
 
 
 def random_faces(surface: Surface, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from reli3d._bridge import present
 from reli3d.geometry.distance import signed_distance
@@ -21,9 +22,7 @@ STRETCH_SIGMA = 0.18  # standard deviation of the logarithm of the scale along e
 GAIN = 0.2  # standard deviation of the logarithm of the factor of the base color
 
 
-@lru_cache(16)  # decoding a texture takes as long as rendering a view
-def _read(path: Path):
-    return read_glb(path)
+_read = lru_cache(16)(read_glb)  # decoding a texture takes as long as rendering a view
 
 
 def outside_distance(surface: Surface, points: Tensor) -> Tensor:
@@ -33,18 +32,17 @@ def outside_distance(surface: Surface, points: Tensor) -> Tensor:
 
 
 class ScannedSurface:
-    """A GLB, centered, longest side 1, randomly stretched and tinted: a ``Surface`` of :mod:`.samples`.
-
-    rng: None keeps proportions and colors.
-    """
+    """A GLB, centered, longest side 1, by ``rng`` randomly stretched and tinted: a ``Surface`` of :mod:`.samples`."""
 
     def __init__(self, path: Path, rng: np.random.Generator | None):
         self.assets = _read(path)
-        points = torch.cat([a.mesh.vertices for a in self.assets])
-        stretch = torch.ones(3) if rng is None else _factors(rng.normal(0, STRETCH_SIGMA, 3))
-        low, high = (points * stretch).amin(0), (points * stretch).amax(0)
+        stretch = self.gain = torch.ones(3)
+        if rng is not None:
+            stretch = _factors(rng.normal(0, STRETCH_SIGMA, 3))
+            self.gain = _factors(rng.normal(0, GAIN, 3) + rng.normal(0, GAIN))
+        points = torch.cat([a.mesh.vertices for a in self.assets]) * stretch
+        low, high = points.amin(0), points.amax(0)
         size = float((high - low).max())
-        self.gain = torch.ones(3) if rng is None else _factors(rng.normal(0, GAIN, 3) + rng.normal(0, GAIN))
         self.assets = [replace(a, mesh=_moved(a.mesh, (low + high) / 2, stretch, size)) for a in self.assets]
         whole = joined([a.mesh for a in self.assets])
         self.vertices, self.faces = whole.vertices, whole.faces
@@ -52,16 +50,13 @@ class ScannedSurface:
         self.scene = RayScene(self.vertices, self.faces)
         self.outer = outer_faces(self.vertices, self.faces, self.scene)
 
-    def distance(self, points: Tensor) -> Tensor:
-        return outside_distance(self, points)
+    distance = outside_distance
 
     def points_at(self, face: Tensor, bary: Tensor) -> SurfacePoints:
         vectors, numbers = torch.empty(4, len(face), 3), torch.empty(2, len(face))
         part = torch.searchsorted(self.starts, face, right=True) - 1
         for k, asset in enumerate(self.assets):
             index = (part == k).nonzero()[:, 0]
-            if len(index) == 0:
-                continue
             local = (face[index] - self.starts[k]).to(torch.int32)
             points = surface_points(asset.mesh, asset.textures, local, bary[index])
             color = (points.base_color * self.gain).clamp(0.0, 1.0)
@@ -75,11 +70,11 @@ def _factors(logarithms: np.ndarray) -> Tensor:
 
 
 def _moved(mesh: Mesh, center: Tensor, stretch: Tensor, size: float) -> Mesh:
-    normals = torch.nn.functional.normalize(present("mesh.normals", mesh.normals) / stretch, dim=-1)
+    normals = normalize(present("mesh.normals", mesh.normals) / stretch, dim=-1)
     tangents = mesh.tangents
     if tangents is not None:
         turned = tangents[:, :3] * stretch
-        turned = torch.nn.functional.normalize(turned - (turned * normals).sum(-1, keepdim=True) * normals, dim=-1)
+        turned = normalize(turned - (turned * normals).sum(-1, keepdim=True) * normals, dim=-1)
         tangents = torch.cat([turned, tangents[:, 3:]], -1)
     vertices = (mesh.vertices * stretch - center) / size
     return replace(mesh, vertices=vertices.contiguous(), normals=normals.contiguous(), tangents=tangents)

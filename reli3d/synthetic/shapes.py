@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from scipy.sparse import coo_matrix
-from torch import Tensor
 
 from reli3d.errors import InputError
 from reli3d.geometry.mesh import joined
@@ -28,15 +27,11 @@ MAX_FACES = 60_000
 class ShapeSurface(ObjectSurface):
     """One or more shapes with procedural materials; holes are closed."""
 
+    distance = outside_distance
+
     def __init__(self, paths: Sequence[Path], rng: np.random.Generator):
-        super().__init__(combine([paths[int(rng.integers(len(paths)))] for _ in range(_count(rng))], rng))
-
-    def distance(self, points: Tensor) -> Tensor:
-        return outside_distance(self, points)
-
-
-def _count(rng: np.random.Generator) -> int:
-    return int(rng.integers(2, 4)) if rng.random() < COMBINED_PROBABILITY else 1
+        count = int(rng.integers(2, 4)) if rng.random() < COMBINED_PROBABILITY else 1
+        super().__init__(combine([paths[int(rng.integers(len(paths)))] for _ in range(count)], rng))
 
 
 @lru_cache(64)
@@ -73,10 +68,7 @@ def capped(v: np.ndarray, f: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, 
 
 
 def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject:
-    """Combines the meshes of ``paths`` into one object: the others are placed next to, on or in the first.
-
-    Raises InputError above MAX_FACES faces.
-    """
+    """One object of the meshes of ``paths``, the others next to, on or in the first.  InputError above MAX_FACES."""
     vertices: list[np.ndarray] = []
     faces, owners, start, parts = [], [], 0, 0
     for k, path in enumerate(paths):
@@ -84,8 +76,7 @@ def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject
         if len(f) < COARSE_FACES and rng.random() < ROUNDED_PROBABILITY:
             v, f, p = rounded(v, f, p, int(rng.integers(1, 3)), float(rng.uniform(0.2, 1.0)))
         v = v * np.exp(rng.normal(0, STRETCH_SIGMA, 3))
-        yaw = rng.uniform(0, 2 * np.pi) if rng.random() < 0.5 else np.pi / 2 * rng.integers(4)
-        turn = yaw_matrix(yaw)
+        turn = yaw_matrix(rng.uniform(0, 2 * np.pi) if rng.random() < 0.5 else np.pi / 2 * rng.integers(4))
         if rng.random() < 0.12:
             turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
             turn[:, 0] *= np.sign(np.linalg.det(turn))
@@ -112,9 +103,8 @@ def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject
     part = part.reshape(-1).astype(np.int32)
     roles = [str(rng.choice(ROLES)) for _ in used]
     materials = draw_materials(rng, roles, part_bounds(v, f, part))
-    crease = CREASE_DEG if rng.random() < 0.7 else float(rng.choice([10.0, 60.0]))
-    f = f.astype(np.int32)
-    return ProceduralObject(v, f, corner_normals(v, f, crease), part, materials, "shape")
+    normals = corner_normals(v, f, CREASE_DEG if rng.random() < 0.7 else float(rng.choice([10.0, 60.0])))
+    return ProceduralObject(v, f.astype(np.int32), normals, part, materials, "shape")
 
 
 def rounded(v: np.ndarray, f: np.ndarray, part: np.ndarray, times: int, strength: float):
@@ -122,13 +112,10 @@ def rounded(v: np.ndarray, f: np.ndarray, part: np.ndarray, times: int, strength
     for _ in range(times):
         if len(f) * 4 > COARSE_FACES * 8:
             break
-        count = len(f)
         v, f, index = trimesh.remesh.subdivide(v, f, return_index=True)
-        source = np.empty(len(f), dtype=np.int64)
-        for old, new in index.items():
-            source[new] = old
-        part = part[source]
-        assert len(f) == 4 * count
+        old, part = part, np.empty(len(f), part.dtype)
+        for source, new in index.items():
+            part[new] = old[source]
         edge = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
         edge = np.concatenate([edge, edge[:, ::-1]])
         graph = coo_matrix((np.ones(len(edge)), (edge[:, 0], edge[:, 1])), shape=(len(v),) * 2).tocsr()

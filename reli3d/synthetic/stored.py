@@ -40,9 +40,8 @@ def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True
             slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 - no iterable
             found = {name: (tuple(s.get_shape()), s.get_dtype()) for name, s in slices.items()}
     except SafetensorError as error:
-        raise InputError(
-            path, f"expected a sample of reli3d-data, got a broken file ({shown(str(error))}); make it again"
-        ) from None
+        problem = f"expected a sample of reli3d-data, got a broken file ({shown(str(error))})"
+        raise InputError(path, f"{problem}; make it again") from None
     sizes: dict[str, int] = {}
     for name, (axes, dtype) in TENSORS.items():
         if (name in POINT_TENSORS and not points) or (name in OPTIONAL and name not in found):
@@ -54,10 +53,8 @@ def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True
             raise InputError(path, f"{name}: expected {dtype} ({', '.join(expected)}), got {found_text}; make it again")
         for letter, size in zip(expected, shape, strict=True):
             if size < 1 or size != (int(letter) if letter.isdigit() else sizes.setdefault(letter, size)):
-                raise InputError(
-                    path,
-                    f"{name}: expected ({', '.join(expected)}) as in its other tensors, got {shape}; make it again",
-                )
+                problem = f"{name}: expected ({', '.join(expected)}) as in its other tensors, got {shape}"
+                raise InputError(path, f"{problem}; make it again")
     if sizes["V"] < views:
         raise InputError(path, f"views: expected at least {views}, got {sizes['V']}; make samples of more views")
 
@@ -65,11 +62,7 @@ def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True
 def check_samples(
     folder: Path, name: str, *, views: int = 1, points: bool = True, also: Callable[[Path], None] = lambda path: None
 ) -> list[Path]:
-    """All sample files of ``folder``, checked.  Raises InputError if one is invalid or there is none.
-
-    name: of the option or argument for error messages.  views, points: as in :func:`check_sample`.  also: additional
-    check of each file.
-    """
+    """All sample files of ``folder``, checked, also by ``also``.  name: of the option.  Raises InputError."""
     if not folder.is_dir():
         raise InputError(name, f"expected a folder of samples, got {shown(str(folder))}; make them with reli3d-data")
     files = sorted(folder.glob("*.safetensors"))

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,12 +36,8 @@ def random_turn(rng: np.random.Generator) -> Tensor:
     """Random rotation ``(3, 3)``: a yaw about +Y, with OTHER_UP_PROBABILITY followed by a change of the up axis."""
     yaw = yaw_matrix(rng.uniform(0, 2 * np.pi))
     if rng.random() < OTHER_UP_PROBABILITY:
-        ups = (
-            [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-            [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
-            [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
-        )
-        yaw = np.array(ups[rng.integers(3)]) @ yaw
+        x, y, z = np.eye(3, dtype=int)
+        yaw = np.array(((x, -z, y), (y, -x, z), (x, -y, -z))[rng.integers(3)]) @ yaw
     return torch.as_tensor(yaw, dtype=torch.float32)
 
 
@@ -118,33 +115,30 @@ def load_sample(
     """Reads up to ``views`` random views of a file, ``points`` volume points and half as many surface points.
 
     augment: False takes the first views unchanged.  lights: ``(n, H, 2H, 3)``, for relighting some of the samples.
-    device: of the sample and of the relighting.
     """
     with safe_open(path, "pt", device=str(device)) as file:
-        total = file.get_slice("c2w").get_shape()[0]
-        order = rng.permutation(total)[:views] if augment else np.arange(min(views, total))
-        chosen = order.tolist()
+        stored = file.get_slice
+        total = stored("c2w").get_shape()[0]
+        chosen = (rng.permutation(total) if augment else np.arange(total))[:views].tolist()
 
         def of_views(key: str) -> Tensor:
-            whole = file.get_slice(key)
-            return torch.stack([whole[k] for k in chosen])
+            return torch.stack([stored(key)[k] for k in chosen])
 
         def run(low: int, high: int) -> slice:
             first = low + int(rng.integers(max(1, high - low - points // 2 + 1)))
             return slice(first, first + points // 2)
 
-        n = file.get_slice("distance").get_shape()[0]
+        n = stored("distance").get_shape()[0]
         runs = [run(0, n // 2), run(n // 2, n)]
-        volume, distance = (torch.cat([file.get_slice(k)[r] for r in runs]).float() for k in ("points", "distance"))
-        s = run(0, file.get_slice("material").get_shape()[0])
-        surface, material = file.get_slice("surface")[s].float(), file.get_slice("material")[s].float() / 255
-        visible = file.get_slice("visible")[s][:, chosen].float()
-        plane = None
+        volume, distance = (torch.cat([stored(k)[r] for r in runs]).float() for k in ("points", "distance"))
+        s = run(0, stored("material").get_shape()[0])
+        surface, material = stored("surface")[s].float(), stored("material")[s].float() / 255
+        visible, plane = stored("visible")[s][:, chosen].float(), None
         if augment and len(chosen) <= MAX_MIRRORED and rng.spawn(1)[0].random() < MIRROR_PROBABILITY:
-            every = file.get_slice("surface")[:, 0].cpu().numpy().astype(np.float64)
+            every = stored("surface")[:, 0].cpu().numpy().astype(np.float64)
             plane = surface_mirror(every)
         if plane is not None:
-            seen = file.get_slice("visible")[:][:, chosen].cpu().numpy()
+            seen = stored("visible")[:][:, chosen].cpu().numpy()
             shown = mirrored_visibility(every, seen, surface[:, 0].cpu().numpy().astype(np.float64), plane)
             unseen = 1.0 - visible.amax(1, keepdim=True)
             visible = torch.cat([visible, torch.as_tensor(shown).to(visible) * unseen], 1)
@@ -215,30 +209,19 @@ def load_sample(
 
 
 def draw_samples(
-    files: Sequence[Path],
-    seeds: Iterable[tuple[int, ...]],
-    *,
-    points: int,
-    max_views: int,
-    lights: Tensor | None = None,
-    device: torch.device | str = "cpu",
+    files: Sequence[Path], seeds: Iterable[tuple[int, ...]], *, points: int, max_views: int, **options: Any
 ) -> list[Sample]:
-    """For each of ``seeds`` a random object of ``files`` with 1 to ``max_views`` random views, on ``device``."""
+    """For each of ``seeds`` a random object of ``files`` with 1 to ``max_views`` views.  options: of load_sample."""
     drawn = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
         file, views = files[int(rng.integers(len(files)))], int(rng.integers(1, max_views + 1))
-        drawn.append(load_sample(file, views, points, rng, lights=lights, device=device))
+        drawn.append(load_sample(file, views, points, rng, **options))
     return drawn
 
 
 def stored_views(sample: dict[str, Tensor], count: int) -> Views:
     """The first ``count`` views of a stored sample, as input of the pipeline."""
-    images = sample["images"][:count].float() / 255
-    return Views(
-        tuple(images[..., :3].contiguous()),
-        tuple(images[..., 3].contiguous()),
-        sample["c2w"][:count],
-        sample["intrinsics"][:count],
-        tuple(f"{i:04d}" for i in range(count)),
-    )
+    color, alpha = (sample["images"][:count].float() / 255).split([3, 1], -1)
+    images, masks, names = color.contiguous(), alpha[..., 0].contiguous(), tuple(f"{i:04d}" for i in range(count))
+    return Views(tuple(images), tuple(masks), sample["c2w"][:count], sample["intrinsics"][:count], names)

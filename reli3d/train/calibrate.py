@@ -1,8 +1,7 @@
 """Calibration of the occupancy logit, by normal maps in held-out views.
 
 An uncertain network predicts occupancies below 0.5 at the true surface, which makes shapes too thin.  A constant added
-to the logit compensates.  Uncertainty depends on the number V of views: the constant is linear in 1 / V through the
-best values of one and of four views, up to OFFSET_VIEWS views.
+to the logit compensates; it is linear in 1 / V through the best values of one and four views, up to OFFSET_VIEWS views.
 """
 
 import math
@@ -45,12 +44,11 @@ def calibrate(
 ) -> dict[int, dict[float, float]]:
     """Sets the surface offsets of the preset by :func:`normal_map_error` over random ``samples``.
 
-    Of the candidates OFFSETS it takes the smallest that :func:`one_standard_error_choice` cannot distinguish from the
-    best.  Returns the mean silhouette IoU of every offset, for each number of views.
+    Takes the smallest of OFFSETS that :func:`one_standard_error_choice` cannot distinguish from the best.  Returns the
+    mean silhouette IoU of every offset, for each number of views.
 
-    samples: folder of samples with more than MANY_VIEWS views, of held-out objects: on objects of its training set the
-    network is too certain.  objects: how many are used.  progress: called with one line per object.  Raises InputError
-    if the folder has no samples.
+    samples: folder of samples with more than MANY_VIEWS views, of held-out objects: on training objects the network is
+    too certain.  objects: how many are used.  progress: called with one line per object.
     """
     files = sorted(samples.glob("*.safetensors"))
     if not files:
@@ -117,8 +115,7 @@ def _reduced(values: Tensor, step: int) -> Tensor:
 def normal_map_error(got: Tensor, filled: Tensor, wanted: Tensor, masked: Tensor) -> float:
     """Squared error of a normal map over the area of the object, as a logarithm; at most MAX_ERROR.
 
-    got, wanted: normals ``(P, 3)`` of any length.  filled, masked: ``(P,)`` bool, the pixels of the mesh and of the
-    object; both maps are zero elsewhere, so that a pixel of only one of them has the error 1.
+    got, wanted: normals ``(P, 3)`` of any length.  filled, masked: ``(P,)`` bool, the pixels of mesh and object.
     """
     got, wanted = functional.normalize(got, dim=-1), functional.normalize(wanted, dim=-1)
     difference = (got * filled[:, None] - wanted * masked[:, None]).square().sum()

@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 
 from reli3d.errors import InputError, shown
 from reli3d.io.files import file_size
-from reli3d.nn.presets import SMALL, LocalPreset, from_json, to_json
+from reli3d.nn.presets import to_json
 from reli3d.nn.weights import BROKEN_TORCH_FILE, check_keys
 from reli3d.train.stage import Stage
 
@@ -48,11 +49,7 @@ def save(
 
 
 def load(path: Path) -> dict[str, Any]:
-    """The dictionary that :func:`save` wrote, on the CPU.
-
-    In files of version 0.2 ``stage`` and ``measures`` are empty.  Raises InputError for a missing or broken file, or
-    one of another kind.
-    """
+    """The dictionary that :func:`save` wrote, on the CPU; ``stage`` is empty in files of 0.2.  Raises InputError."""
     file_size(path)
     try:
         state = torch.load(path, weights_only=True, map_location="cpu")
@@ -71,17 +68,8 @@ def load(path: Path) -> dict[str, Any]:
     return {"stage": "", "seconds": 0.0, "measures": {}, **state}
 
 
-def small_preset(state: dict[str, Any]) -> LocalPreset:
-    """Preset of a checkpoint of the small network; SMALL where ``state`` has none, or that of another network."""
-    preset = from_json(state["preset"]) if "preset" in state else SMALL
-    return preset if isinstance(preset, LocalPreset) else SMALL
-
-
 def to_resume(path: Path, stage: Stage, groups: list[dict]) -> dict[str, Any]:
-    """The checkpoint from which ``stage`` resumes.  Raises InputError if it is of another stage or network.
-
-    groups: parameter groups of the optimizer that resumes.
-    """
+    """The checkpoint from which ``stage`` resumes, with ``groups`` of parameters; InputError if it is of another."""
 
     def sizes(groups: list[dict]) -> list[tuple]:
         return [(len(group["params"]), group.get("times")) for group in groups]
@@ -96,9 +84,20 @@ def to_resume(path: Path, stage: Stage, groups: list[dict]) -> dict[str, Any]:
     return state
 
 
-def check_shapes(
-    path: Path, state: dict[str, Tensor], model: nn.Module, missing_parameters: set[str] | None = None
-) -> None:
-    """Raise InputError unless ``state`` has the tensors of ``model`` but for those ``missing_parameters``."""
-    shapes = {k: tuple(v.shape) for k, v in model.state_dict().items() if k not in (missing_parameters or ())}
+def check_shapes(path: Path, state: dict[str, Tensor], model: nn.Module, missing: Container[str] = ()) -> None:
+    """Raises InputError unless ``state`` has the tensors of ``model`` except those named in ``missing``."""
+    shapes = {k: tuple(v.shape) for k, v in model.state_dict().items() if k not in missing}
     check_keys(path, {k: tuple(v.shape) for k, v in state.items()}, shapes)
+
+
+def load_average(
+    path: Path, model: nn.Module, state: dict[str, Any] | None = None, missing: Container[str] = ()
+) -> dict[str, Any]:
+    """Loads the averaged weights of a checkpoint into ``model``; returns the checkpoint.
+
+    state: the checkpoint if it is read already.  missing: names of parameters that it may lack.  Raises InputError.
+    """
+    state = state or load(path)
+    check_shapes(path, state["average"], model, missing)
+    model.load_state_dict(state["average"], strict=not missing)
+    return state

@@ -1,11 +1,9 @@
 """Training of the environment prior: a RENI++ decoder, jointly with one latent code per map (an auto-decoder).
 
-The decoder is equivariant to rotation about the vertical axis, so maps need no augmentation by yaw.  Blends of two
-maps with a relative rotation and a tint augment a small collection.  Maps are scaled to a geometric mean of 1; the
-exposure is a separate output of the network.  Source: Gardner et al. 2023, RENI++, arXiv 2311.09361, section 4.
+The decoder is equivariant to rotation about the vertical axis.  Blends of two maps augment a small collection.  Maps
+are scaled to a geometric mean of 1.  Source: Gardner et al. 2023, RENI++, arXiv 2311.09361, section 4.
 """
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,11 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import cosine_similarity
 
 from reli3d.nn.presets import Preset
 from reli3d.nn.reni import EnvironmentDecoder, reni_frame
-from reli3d.nn.reni_fit import COSINE, FLOOR, PRIOR
+from reli3d.nn.reni_fit import FLOOR, WEIGHTS, terms
 from reli3d.render.latlong import lat_long_directions
 from reli3d.synthetic.maps import ROWS, training_maps
 from reli3d.train.stage import Stage
@@ -60,7 +57,7 @@ class LightPriorStage(Stage):
     """The decoder of ``preset``, on the maps of :func:`~reli3d.synthetic.maps.load_maps` that are not held out."""
 
     name = "light_prior"
-    weights = {"radiance": 1.0, "color": COSINE, "latents": PRIOR}
+    weights = WEIGHTS
     settings = {"steps": 8000, "batch": 16, "rate": 1e-2, "final_rate": 1e-4, "weight_decay": 0.0}
 
     def __init__(self, preset: Preset, maps: Path, *, seed: int = 0, added: int = BLENDS):
@@ -82,12 +79,7 @@ class LightPriorStage(Stage):
         picked, texel = item
         latents, target = self.model.latents[picked], self.texels[picked][:, texel] + FLOOR
         log_radiance = self.model.decoder.field(latents, self.directions[texel][None])
-        floored = torch.logaddexp(log_radiance, torch.full_like(log_radiance, math.log(FLOOR)))
-        return {
-            "radiance": (floored - target.log()).abs().mean(),
-            "color": 1 - cosine_similarity(log_radiance.exp() + FLOOR, target, dim=-1).mean(),
-            "latents": latents.square().mean(),
-        }
+        return terms(log_radiance, target, latents)
 
     def rate_factor(self, parameter: str) -> float:
         return 1.0 if parameter == "latents" else 0.1

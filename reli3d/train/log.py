@@ -9,10 +9,7 @@ from reli3d.errors import InputError
 
 
 class Log:
-    """``log.jsonl``: one JSON object per line; a run begins with its configuration.
-
-    On resuming, rows after ``step`` and a half-written last row are removed.
-    """
+    """``log.jsonl``: one JSON object per line, the configuration first; on resuming, later rows are removed."""
 
     def __init__(self, path: Path, step: int, configuration: Mapping[str, Any]):
         kept = []
@@ -38,7 +35,6 @@ def summary_writer() -> type:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        raise InputError(
-            "--tensorboard", "expected the package tensorboard, got none; pip install tensorboard"
-        ) from None
+        problem = "expected the package tensorboard, got none; pip install tensorboard"
+        raise InputError("--tensorboard", problem) from None
     return SummaryWriter

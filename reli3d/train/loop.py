@@ -1,9 +1,4 @@
-"""The training loop of all stages: schedule, optimizer, averaged weights, checkpoints and log.
-
-A :class:`~reli3d.train.stage.Stage` supplies the model, multipliers of the learning rate, batches, losses and
-validation images.  A run resumes from its last checkpoint; on a CPU the result is bitwise identical to that of an
-uninterrupted run.
-"""
+"""The training loop of all stages, which resumes from its last checkpoint; on a CPU bitwise identically."""
 
 import math
 import sys
@@ -49,32 +44,26 @@ def parameter_groups(stage: Stage, weight_decay: float) -> list[dict]:
 
 
 def accumulate(stage: Stage, items: Sequence[Any]) -> Tensor:
-    """Accumulates the gradients of the mean loss over ``items``, one item at a time; returns sums for the log.
+    """Accumulates the gradients of the mean loss over ``items``, one item at a time.
 
-    ``(2 T + 2,)``: for each of the T terms of ``stage.weights`` the sum of its values; for each term the number of
-    items that have it; the sum of the weighted losses; the number of items.
+    Returns ``(T + 1, 2)`` for the log: the sum of the weighted losses and, for each of the T terms of
+    ``stage.weights``, that of its values; and the number of items that have them.
     """
-    names = list(stage.weights)
-    values = torch.zeros(2 * len(names) + 2, dtype=torch.float64)
+    names = ["loss", *stage.weights]
+    values = torch.zeros(len(names), 2, dtype=torch.float64)
     for item in items:
         terms = stage.losses(item)
         loss = reduce(torch.add, [stage.weights[name] * value for name, value in terms.items()])
         (loss / len(items)).backward()
-        *of_terms, of_item = torch.stack([*terms.values(), loss]).detach().double().tolist()
-        for name, value in zip(terms, of_terms, strict=True):
-            values[names.index(name)] += value
-            values[len(names) + names.index(name)] += 1
-        values[-2] += of_item
-        values[-1] += 1
+        index = [names.index(name) for name in ("loss", *terms)]
+        values[index, 0] += torch.stack([loss, *terms.values()]).detach().double().cpu()
+        values[index, 1] += 1
     return values
 
 
 def row_of(stage: Stage, sums: Tensor) -> dict[str, float]:
     """Row of the log: the mean loss, and the mean of each term over the items that have it."""
-    names = list(stage.weights)
-    counts = sums[len(names) : 2 * len(names)]
-    means = {n: round(float(s / c), 6) for n, s, c in zip(names, sums, counts, strict=False) if c > 0}
-    return {"loss": round(float(sums[-2] / sums[-1]), 6), **means}
+    return {n: round(float(s / c), 6) for n, (s, c) in zip(("loss", *stage.weights), sums, strict=True) if c > 0}
 
 
 @torch.no_grad()
@@ -88,34 +77,32 @@ def update_average(average: dict[str, Tensor], model: nn.Module, decay: float) -
 def train(stage: Stage, options: Options, workers: Workers | None = None) -> None:
     """Trains ``stage.model`` in place to the end of the schedule; resumes from ``output/state.pt`` if it exists.
 
-    workers: processes that divide each batch; all start from the same parameters, the first one writes files.  A step
-    whose gradients are not finite is skipped; ``options.bad_steps`` such steps in a row raise RuntimeError.  Raises
-    InputError for a batch size that the processes do not divide and for a checkpoint of another stage.
+    workers: processes that divide each batch; the first one writes files.  A step whose gradients are not finite is
+    skipped; ``options.bad_steps`` in a row raise RuntimeError.  Raises InputError for a wrong batch size or checkpoint.
     """
     workers = workers or Workers()
     model, folder, first = stage.model, Path(options.output), workers.rank == 0
+    path = folder / "state.pt"
     if options.batch % workers.count:
         raise InputError("batch", f"expected a multiple of the {workers.count} processes, got {options.batch}")
     folder.mkdir(parents=True, exist_ok=True)
-    state: dict = {}
-    if (folder / "state.pt").exists():
-        state = checkpoint.to_resume(folder / "state.pt", stage, parameter_groups(stage, options.weight_decay))
-        model.load_state_dict(state["model"])
     groups = parameter_groups(stage, options.weight_decay)
     trained = [p for group in groups for p in group["params"]]
     optimizer = stage.optimizer(groups, lr=options.rate, betas=(0.9, 0.98), fused=True)
     step, seconds, average = 0, 0.0, {k: v.detach().clone() for k, v in model.state_dict().items()}
-    if state:
+    if path.exists():
+        state = checkpoint.to_resume(path, stage, groups)
+        model.load_state_dict(state["model"])
+        optimizer.load_state_dict(state["optimizer"])
         step, seconds = state["step"], state["seconds"]
         average = {k: v.to(average[k].device) for k, v in state["average"].items()}
-        optimizer.load_state_dict(state["optimizer"])
-        state.clear()
+        del state
     measures = stage.measures()
     about = {"stage": stage.name, "processes": workers.count, **asdict(options), **stage.configuration}
     log = Log(folder / "log.jsonl", step, about) if first else None
     board = summary_writer()(options.tensorboard, purge_step=step + 1) if first and options.tensorboard else None
     began, bad = time.monotonic() - seconds, 0
-    sums = torch.zeros(2 * len(stage.weights) + 2, dtype=torch.float64)
+    sums = torch.zeros(len(stage.weights) + 1, 2, dtype=torch.float64)
     if step == 0 and first:
         checkpoint.save(folder, stage, optimizer, average, step, seconds, about, measures)
     bar = tqdm(total=100, disable=None if first else True, bar_format="{desc} {percentage:3.0f}% {bar}")
@@ -127,18 +114,16 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
         torch.manual_seed((options.seed << 32) + step)  # random losses draw the same numbers after resuming
         values = accumulate(stage, stage.batch(step, range(workers.rank, options.batch, workers.count)))
         clock = torch.tensor([time.monotonic() - began], dtype=torch.float64)
-        values = workers.average(trained, torch.cat([values, clock]).float()).double()
+        values = workers.average(trained, torch.cat([values.flatten(), clock]).float()).double()
         norm = nn.utils.clip_grad_norm_(trained, options.clip)
         bad = 0 if torch.isfinite(norm) else bad + 1
         if not bad:
             optimizer.step()
         elif bad >= options.bad_steps:
-            raise RuntimeError(
-                f"gradients: expected finite ones, got none in {bad} steps; the last checkpoint is "
-                f"{folder / 'state.pt'}"
-            )
+            problem = f"expected finite ones, got none in {bad} steps; the last checkpoint is {path}"
+            raise RuntimeError(f"gradients: {problem}")
         update_average(average, model, min(options.average, (1 + step) / (10 + step)))
-        step, seconds, sums = step + 1, float(values[-1]), sums + values[:-1]
+        step, seconds, sums = step + 1, float(values[-1]), sums + values[:-1].view_as(sums)
         bar.set_description(f"{stage.name}, step {step}", refresh=False)
         bar.update(100 * progress(options, step, seconds) - bar.n)
         last = progress(options, step, seconds) >= 1.0

@@ -12,24 +12,11 @@ from reli3d.train.batches import Sample, TrainingViews
 from reli3d.train.pixels import Group, predict_pixels
 
 WEIGHTS = {
-    "occupancy": 1.0,
-    "surface": 0.02,
-    "gradient": 0.6,
-    "base_color": 2.0,
-    "pattern": 0.24,
-    "roughness": 2.0,
-    "metallic": 2.0,
-    "normal": 1.0,
-    "pixel_color": 1.5,
-    "pixel_pattern": 0.24,
-    "pixel_roughness": 2.0,
-    "pixel_metallic": 2.0,
-    "pixel_normal": 1.0,
-    "pixel_depth": 0.3,
-    "light": 0.4,
-    "light_scale": 0.1,
-    "irradiance": 0.4,
-}
+    "occupancy": 1.0, "surface": 0.02, "gradient": 0.6,
+    "base_color": 2.0, "pattern": 0.24, "roughness": 2.0, "metallic": 2.0, "normal": 1.0,
+    "pixel_color": 1.5, "pixel_pattern": 0.24, "pixel_roughness": 2.0, "pixel_metallic": 2.0, "pixel_normal": 1.0,
+    "pixel_depth": 0.3, "light": 0.4, "light_scale": 0.1, "irradiance": 0.4,
+}  # fmt: skip
 MAX_PERTURBATION = 0.02, 0.3  # position [model's cube] and normal [radian] of an extracted surface deviate by so much
 GRADIENT_POINTS, GRADIENT_STEP = 384, 0.012  # surface points with a gradient loss; finite-difference step, a grid cell
 PATTERN_FLOOR = 0.002  # mean squared error added to that of a pattern: 27 dB
@@ -104,10 +91,7 @@ def _material_terms(
 
 
 def perturbed(position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Points ``(N, 3)`` shifted along their normals and tilted normals, by the errors of an extracted surface.
-
-    The amplitude is drawn once for all points, since it varies between objects.
-    """
+    """Points ``(N, 3)`` shifted along their normals, and tilted normals, by the errors of an extracted surface."""
     amplitude = torch.rand((), device=position.device)
     distance = MAX_PERTURBATION[0] * amplitude * torch.randn_like(position[:, :1])
     # two of three components tilt the normal
@@ -127,9 +111,8 @@ def excess_entropy(value: Tensor, target: Tensor) -> Tensor:
 def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
     """Scale-invariant difference of base colors ``(N, 3)``, sRGB: ``log(1 + mse / PATTERN_FLOOR)``.
 
-    The mean squared error is that of sRGB values after the best factor per channel in linear light, because exposure
-    makes the absolute albedo ambiguous, but not its variation over the surface.  Gradients also flow through the
-    factor.  The logarithm balances objects with weak and with strong patterns.
+    After the best factor per channel in linear light, because exposure makes the absolute albedo ambiguous.  The
+    logarithm balances objects with weak and with strong patterns.
     """
     p, t = srgb_to_linear(color), srgb_to_linear(target)
     factor = (p * t).sum(0) / p.square().sum(0).clamp(min=1e-4)
@@ -145,34 +128,25 @@ def _pixel_terms(pixels: PixelMaps, shown: Tensor, views: TrainingViews, counts:
     pairs = zip(color.split(of_objects), target[:, :3].split(of_objects), strict=True)
     patterns = [pattern_loss(c, w) if len(w) else w.sum() for c, w in pairs]
     weight = color.new_tensor([count if n else 0 for count, n in zip(counts, of_objects, strict=True)])
+    depths = pixels.depth[valid][:, 0] / DEPTH_UNIT, views.view_depth[valid] / DEPTH_UNIT
     found = {
         "pixel_color": excess_entropy(color, target[:, :3]),
         "pixel_pattern": (torch.stack(patterns) * weight).sum() / weight.sum(),
         "pixel_normal": (1 - (pixels.normal[valid] * views.view_normal[valid]).sum(-1)).mean(),
-        "pixel_depth": functional.smooth_l1_loss(
-            pixels.depth[valid][:, 0] / DEPTH_UNIT, views.view_depth[valid] / DEPTH_UNIT, beta=0.2
-        ),
+        "pixel_depth": functional.smooth_l1_loss(*depths, beta=0.2),
     }
-    return found | _finish(pixels, views)
-
-
-def _finish(pixels: PixelMaps, views: TrainingViews) -> dict[str, Tensor]:
-    """Cross-entropy of roughness and metallic per pixel; empty without targets."""
-    valid = views.view_valid & views.finish_known[:, None, None]
-    if not bool(valid.any()):
-        return {}
-    rough, metal = views.view_material[valid][:, 3:].unbind(1)
-    rough = ((rough - ROUGHNESS_MIN) / (1.0 - ROUGHNESS_MIN)).clamp(min=0.0)  # the range of the network's values
-    return {
-        "pixel_roughness": excess_entropy(pixels.roughness[valid][:, 0].sigmoid(), rough),
-        "pixel_metallic": excess_entropy(pixels.metallic[valid][:, 0].sigmoid(), metal),
-    }
+    valid = valid & views.finish_known[:, None, None]
+    if bool(valid.any()):
+        rough, metal = views.view_material[valid][:, 3:].unbind(1)
+        rough = ((rough - ROUGHNESS_MIN) / (1.0 - ROUGHNESS_MIN)).clamp(min=0.0)  # the range of the network's values
+        found["pixel_roughness"] = excess_entropy(pixels.roughness[valid][:, 0].sigmoid(), rough)
+        found["pixel_metallic"] = excess_entropy(pixels.metallic[valid][:, 0].sigmoid(), metal)
+    return found
 
 
 def _light_terms(field: LocalField, sample: Sample) -> dict[str, Tensor]:
     """Mean absolute differences of log radiance and log irradiance, without a scale per channel, ``light_scale``."""
-    log = field.log_light
-    count = len(sample.light)
+    log, count = field.log_light, len(sample.light)
     rows = int((count // 2) ** 0.5)
     angle = torch.sin((torch.arange(count) // (2 * rows) + 0.5) * torch.pi / rows).to(log)
     got = Environment(log.permute(1, 2, 0).contiguous()).lookup(sample.light_directions)

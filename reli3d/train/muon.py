@@ -1,8 +1,4 @@
-"""Muon for matrices and convolutions, AdamW for the other parameters.
-
-Muon orthogonalizes the momentum of a matrix, so that all its singular directions are updated at the same rate (Jordan
-et al. 2024, https://kellerjordan.github.io/posts/muon).
-"""
+"""Muon for matrices and convolutions (Jordan et al. 2024, kellerjordan.github.io/posts/muon), AdamW for the others."""
 
 import torch
 from torch import Tensor
@@ -27,11 +23,7 @@ def orthogonalized(matrix: Tensor) -> Tensor:
 
 
 class Muon(torch.optim.AdamW):
-    """AdamW in which matrices of at least MIN_RANK, and convolutions as matrices ``(outputs, rest)``, follow Muon.
-
-    The step of a matrix is the orthogonalized Nesterov momentum, scaled to the root mean square ``UPDATE_RMS``, so that
-    both share learning rate and weight decay.  Groups whose ``times`` exceeds MAX_TIMES are left to AdamW.
-    """
+    """AdamW in which matrices, and convolutions as such, of at least MIN_RANK follow Muon if ``times`` <= MAX_TIMES."""
 
     @torch.no_grad()
     def step(self, closure=None):

@@ -1,8 +1,4 @@
-"""Training of the 2D U-Net alone, with many views per step, at full, half or a quarter of the resolution.
-
-The coarse levels are trained first on small images, which cost less.  Finer levels are added later and start by adding
-a residual of zero (after Karras et al. 2018, Progressive Growing of GANs, arXiv 1710.10196).
-"""
+"""Training of the 2D U-Net alone, at growing resolution (after Karras et al. 2018, Progressive Growing, 1710.10196)."""
 
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -19,14 +15,7 @@ from reli3d.geometry.hull import mask_distance
 from reli3d.nn.local import QUARTER, LocalReconstructor, PixelMaps, mean_logit, pixel_colors
 from reli3d.nn.presets import LocalPreset
 from reli3d.nn.pyramid import ImagePyramid, depth_of_origin, pixel_hull_depths, pixel_positions
-from reli3d.train.batches import (
-    UNCHANGED_PROBABILITY,
-    TrainingViews,
-    finish_known,
-    permuted,
-    valid_means,
-    with_noise,
-)
+from reli3d.train.batches import UNCHANGED_PROBABILITY, TrainingViews, finish_known, permuted, valid_means, with_noise
 
 FULL_SIDE = 256  # pixels of an image at the finest level
 CACHE_BYTES = 1 << 31  # of small images in the memory of a process
@@ -62,17 +51,6 @@ def missing_parameters(preset: LocalPreset, names: Container[str]) -> set[str]:
     with torch.device("meta"):
         whole, small = (set(ImagePyramid(preset.pyramid, k).state_dict()) for k in (0, finest))
     return {f"pyramid.{name}" for name in whole - small}
-
-
-def load_levels(model: LocalReconstructor, state: dict[str, Tensor]) -> LocalReconstructor:
-    """Loads ``state`` into ``model`` and returns it; ``state`` may lack the finer levels of the 2D U-Net.
-
-    Raises ValueError if other parameters are missing or unknown.
-    """
-    missing, unknown = model.load_state_dict(state, strict=False)
-    if lost := [*unknown, *(set(missing) - missing_parameters(model.preset, state))]:
-        raise ValueError(f"state: expected the parameters of the network, got a difference in {lost[0]}")
-    return model
 
 
 def is_pixel_parameter(name: str) -> bool:
@@ -127,21 +105,20 @@ def augmented(views: TrainingViews, rng: np.random.Generator) -> TrainingViews:
     """``views`` in random order, randomly mirrored, with permuted color channels and noise."""
     device = views.images.device
     views = views.of_views(torch.as_tensor(rng.permutation(len(views.masks)), device=device))
-    changed = {}
     if rng.random() > UNCHANGED_PROBABILITY:
         maps = ("images", "masks", "silhouette", "view_material", "view_normal", "view_depth", "view_valid")
-        views = replace(views, **{name: getattr(views, name).flip(2).contiguous() for name in maps})
+        changed = {name: getattr(views, name).flip(2).contiguous() for name in maps}
         flip = torch.tensor([-1.0, 1.0, 1.0], device=device)
+        changed["view_normal"] = changed["view_normal"] * flip
         c2w, intrinsics = views.c2w.clone(), views.intrinsics.clone()
         c2w[:, :3] *= flip[:, None]
         c2w[:, :, 0] *= -1  # the camera stays right-handed, its image is flipped
         intrinsics[:, 2] = views.masks.shape[2] - intrinsics[:, 2]
-        changed = {"c2w": c2w, "intrinsics": intrinsics, "view_normal": views.view_normal * flip}
+        views = replace(views, c2w=c2w, intrinsics=intrinsics, **changed)
     color, material = views.images, views.view_material
     if rng.random() > UNCHANGED_PROBABILITY:
         color, material = permuted(rng, color, material)
-    color = with_noise(color, rng).contiguous()
-    return replace(views, images=color, view_material=material.contiguous(), **changed)
+    return replace(views, images=with_noise(color, rng).contiguous(), view_material=material.contiguous())
 
 
 class ViewCache:

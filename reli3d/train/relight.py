@@ -84,9 +84,8 @@ def relight_views(
     """Views ``(V, S, S, 4)`` under ``light (H, 2H, 3)``, and that map as ``(32, 64, 3)`` at the views' exposure.
 
     images: ``(V, S, S, 4)``, of which only alpha is used.  material, normal: of the pixels ``valid (V, S, S)``, as in
-    :mod:`reli3d.synthetic.samples`.  camera: the batch of V.  flash: mean radiance of the object under a light at each
-    camera, highlights included, relative to that under ``light``.  Without shadows: the G-buffers have no geometry
-    behind other surfaces.
+    :mod:`reli3d.synthetic.samples`.  flash: mean radiance of the object under a light at each camera, relative to that
+    under ``light``.  Without shadows: the G-buffers have no geometry behind other surfaces.
     """
     views, size = images.shape[:2]
     light = light.to(images.device)
@@ -101,7 +100,11 @@ def relight_views(
     options = ShadeOptions(samples=SAMPLES, seed=int(rng.integers(1 << 30)), diffuse_model=DIFFUSE_MODEL)
     radiance = shade(points, wo, environment, options=options)
     if flash:
-        lit = _lit_by_flash(points, wo)
+        cosine = (points.normal * wo).sum(-1).clamp(0.0, 1.0)
+        local = torch.stack([(1.0 - cosine * cosine).sqrt(), torch.zeros_like(cosine), cosine], -1)
+        width = points.roughness * points.roughness
+        bsdf = eval_bsdf(local, points.base_color, width, points.metallic, local, diffuse_model=DIFFUSE_MODEL)
+        lit = bsdf * cosine[:, None]  # under unit irradiance from the camera
         radiance = radiance + lit * (flash * radiance.mean() / lit.mean().clamp(min=1e-6))
     first_view = int(valid[0].sum()) or len(radiance)
     bright = float(radiance[:first_view].mean(-1).quantile(0.9))
@@ -116,12 +119,3 @@ def relight_views(
     linear = ((alpha * surface + (1 - alpha) * background) * exposure).clamp(0, SATURATES).clamp(max=1.0)
     kept = functional.interpolate((light * exposure).permute(2, 0, 1)[None], (32, 64), mode="area")
     return torch.cat([linear_to_srgb(linear), alpha], -1), kept[0].permute(1, 2, 0).clamp(max=6e4)
-
-
-def _lit_by_flash(points: SurfacePoints, wo: Tensor) -> Tensor:
-    """Radiance ``(N, 3)`` towards ``wo (N, 3)`` under unit irradiance from there, perpendicular to ``wo``."""
-    cosine = (points.normal * wo).sum(-1).clamp(0.0, 1.0)
-    local = torch.stack([(1.0 - cosine * cosine).sqrt(), torch.zeros_like(cosine), cosine], -1)
-    alpha = points.roughness * points.roughness
-    bsdf = eval_bsdf(local, points.base_color, alpha, points.metallic, local, diffuse_model=DIFFUSE_MODEL)
-    return bsdf * cosine[:, None]

@@ -35,17 +35,12 @@ LIST_EVERY = 50  # steps after which the folders are listed again: samples may b
 
 @dataclass(frozen=True)
 class SmallOptions:
-    """Options of :class:`SmallStage`.
+    """Options of :class:`SmallStage`."""
 
-    max_views: upper limit of the random number of input views.  points: volume points per object; half as many surface
-    points.  pyramid_rate: multiplier of the learning rate of the 2D U-Net, which small batches degrade at the full
-    rate.  bfloat16: compute dtype of the convolutions.
-    """
-
-    max_views: int = 6
-    points: int = 2048
-    pyramid_rate: float = 1.0
-    bfloat16: bool = False
+    max_views: int = 6  # upper limit of the random number of input views
+    points: int = 2048  # in the volume, of each object; half as many on the surface
+    pyramid_rate: float = 1.0  # multiplier of the learning rate of the 2D U-Net, which small batches degrade
+    bfloat16: bool = False  # compute dtype of the convolutions
 
 
 class SmallStage(Stage):

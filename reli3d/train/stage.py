@@ -33,10 +33,7 @@ class Options:
 
 
 class Stage(ABC):
-    """A model with its batches and losses, trained by :func:`reli3d.train.loop.train`.
-
-    A subclass sets the first four attributes and implements ``batch`` and ``losses``.
-    """
+    """A model with its batches and losses, trained by :func:`reli3d.train.loop.train`."""
 
     name: str
     model: Any  # torch.nn.Module with ``preset``
@@ -47,10 +44,7 @@ class Stage(ABC):
 
     @abstractmethod
     def batch(self, step: int, objects: range) -> Sequence[Any]:
-        """Items at the positions ``objects`` of the batch of ``step``.
-
-        A function of the seed, the step and the positions alone, so that the number of processes does not matter.
-        """
+        """Items at the positions ``objects`` of the batch of ``step``: a function of these and the seed alone."""
 
     @abstractmethod
     def losses(self, item: Any) -> dict[str, Tensor]:
@@ -61,10 +55,7 @@ class Stage(ABC):
         return 1.0
 
     def measures(self) -> dict[str, float]:
-        """Metrics that are logged and stored with every checkpoint; raises InputError if training cannot continue.
-
-        Called before the first step and at every checkpoint, by all processes.
-        """
+        """Metrics logged and stored at the start and at every checkpoint; InputError if training cannot continue."""
         return {}
 
     def validation(self, average: dict[str, Tensor]) -> np.ndarray | None:

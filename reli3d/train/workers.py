@@ -1,8 +1,4 @@
-"""Data parallelism: each process computes a part of the batch, gradients are averaged.
-
-Start with ``torchrun --nproc-per-node N``.  On a CPU one single-threaded process per core does about 2 times the steps
-of one process with all threads: the operations of a small network are too short for intra-operation parallelism.
-"""
+"""Data parallelism under ``torchrun --nproc-per-node N``: each process computes a part of the batch."""
 
 import os
 from collections.abc import Sequence
@@ -30,10 +26,7 @@ class Workers:
         return Workers(distributed.get_rank(), distributed.get_world_size())
 
     def average(self, parameters: Sequence[Tensor], values: Tensor) -> Tensor:
-        """Mean of ``values (k,)`` over the processes; also averages the gradients of ``parameters`` in place.
-
-        A missing gradient counts as zero, so that all processes reduce buffers of the same size.
-        """
+        """Mean of ``values (k,)`` over the processes; also averages the gradients, of which missing ones are zero."""
         if self.count == 1:
             return values
         grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
@@ -46,11 +39,7 @@ class Workers:
         return flat[-len(values) :].to(values.device, copy=True)
 
     def leave(self) -> None:
-        """Destroys the group; with several processes also exits this one, with code 0.
-
-        Threads of Gloo release tensors some time after an operation, which needs the interpreter and aborts the process
-        if that is shutting down.  Therefore the process exits without interpreter shutdown; flush output before.
-        """
+        """With several processes destroys the group and exits with 0: Gloo's threads would abort a normal exit."""
         if self.count == 1:
             return
         distributed.barrier()

@@ -74,7 +74,7 @@ def test_vertex_colors_are_baked_where_the_format_has_none_and_notes_are_printed
     data = (tmp_path / "mesh.glb").read_bytes()
     (tmp_path / "mesh.glb").write_bytes(data.replace(b'"doubleSided":false', b'"alphaMode":"BLEND"'))
     assert main([str(tmp_path / "mesh.glb"), "--format", "obj", "--output", str(tmp_path)]) == 0
-    assert "reli3d-export: mesh.glb: alpha is left out\n" in capsys.readouterr().err
+    assert "reli3d export: mesh.glb: alpha is left out\n" in capsys.readouterr().err
     shape = trimesh.load(tmp_path / "mesh.obj", process=False, force="mesh")
     image = np.asarray(shape.visual.material.image.convert("RGB")).astype(float) / 255.0
     row, column = ((1 - shape.visual.uv[:, 1]) * 128).astype(int), (shape.visual.uv[:, 0] * 128).astype(int)

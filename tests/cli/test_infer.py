@@ -10,7 +10,7 @@ import torch
 
 from reli3d.cli import checking as check
 from reli3d.cli import infer
-from reli3d.cli.help_format import joined
+from reli3d.cli.options import joined
 from reli3d.geometry.camera import Camera
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment

@@ -13,7 +13,7 @@ from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.shading import Samples, ShadeOptions, shade
 from reli3d.synthetic.materials import Coat, Material
-from reli3d.synthetic.patterns import Mosaic
+from reli3d.synthetic.patterns import mosaic as spots
 from reli3d.synthetic.procedural import ProceduralObject, make_object
 from reli3d.synthetic.samples import ObjectSurface
 
@@ -46,15 +46,15 @@ def scene_surface(seed: int, table_yaw: float = 0.0, table: float = TABLE) -> tu
     shape = make_object(seed)
     c, s = np.cos(table_yaw), np.sin(table_yaw)
     turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-    mosaic = [Mosaic(turn * f, 7 + k, fraction=0.5) for k, f in enumerate((9.0, 23.0, 51.0))]
+    mosaic = [spots(turn * f, 7 + k, fraction=0.5) for k, f in enumerate((9.0, 23.0, 51.0))]
     dark, light, warm = Coat((0.05, 0.06, 0.08), 0.9), Coat((0.7, 0.68, 0.6), 0.9), Coat((0.5, 0.2, 0.1), 0.9)
     stone = Material(Coat((0.3, 0.3, 0.32), 0.9), ((dark, mosaic[0]), (light, mosaic[1]), (warm, mosaic[2])))
     skin = [
         Material(
             Coat(c, 0.7),
             (
-                (Coat(d, 0.7), Mosaic(np.eye(3) * 14.0, 31 + k, fraction=0.5)),
-                (Coat(e, 0.7), Mosaic(np.eye(3) * 37.0, 61 + k, fraction=0.4)),
+                (Coat(d, 0.7), spots(np.eye(3) * 14.0, 31 + k, fraction=0.5)),
+                (Coat(e, 0.7), spots(np.eye(3) * 37.0, 61 + k, fraction=0.4)),
             ),
         )
         for k, (c, d, e) in enumerate((((0.6, 0.1, 0.1), (0.8, 0.7, 0.2), (0.1, 0.1, 0.3)),) * len(shape.materials))

@@ -16,6 +16,7 @@ from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.presets import SMALL
 from reli3d.nn.pyramid import ImagePyramid
 from reli3d.train.batches import TrainingViews, load_sample
+from reli3d.train.checkpoint import load_average
 from reli3d.train.loop import train
 from reli3d.train.losses import PIXEL_TERMS, losses, pixel_losses
 from reli3d.train.pixels import (
@@ -24,7 +25,7 @@ from reli3d.train.pixels import (
     augmented,
     draw_group,
     is_pixel_parameter,
-    load_levels,
+    missing_parameters,
     predict_pixels,
     read_views_reduced,
     reduced_model,
@@ -176,7 +177,7 @@ def test_levels_are_trained_one_after_the_other(folder, tmp_path, capsys):
         assert all(float((more[k] - v).abs().max()) < 1e-6 for k, v in fewer.items())
     del small["pyramid.shared.weight"]
     with pytest.raises(ValueError, match="pyramid.shared.weight"):
-        load_levels(LocalReconstructor(SMALL), small)
+        load_average(tmp_path, LocalReconstructor(SMALL), {"average": small}, missing_parameters(SMALL, small))
 
 
 def test_training_of_pixels_teaches_the_2d_u_net_alone(folder, tmp_path):

@@ -6,6 +6,7 @@ import torch
 from safetensors.torch import save_file
 from torch.nn import functional
 
+from reli3d.errors import InputError
 from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.latlong import lat_long_directions, quarter_turn
@@ -167,3 +168,12 @@ def test_lights_are_drawn_from_the_maps_that_training_may_see(tmp_path):
     assert len(lights) == 10 and torch.equal(lights[0], quarter_turn(torch.from_numpy(maps[0]), -1))
     drawn = draw_light(lights, np.random.default_rng(1))
     assert drawn.shape == (64, 128, 3) and float(drawn.min()) > 0
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
+def test_a_map_whose_radiance_is_not_light_is_refused(value, tmp_path):
+    maps = np.ones((6, 8, 16, 3), np.float32)
+    maps[2, 3, 4, 1] = value
+    np.savez(tmp_path / "maps.npz", env=maps, names=[f"m{k}" for k in range(6)])
+    with pytest.raises(InputError, match="env: expected finite radiance of at least 0, got others in m2"):
+        training_maps(tmp_path / "maps.npz")

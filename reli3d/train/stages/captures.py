@@ -5,7 +5,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from reli3d.errors import InputError, shown
 from reli3d.io.files import read_bytes
@@ -23,10 +22,7 @@ CACHED_CAPTURES = 64  # preprocessed captures in memory: 50 MB at 4 views
 
 
 class Captures:
-    """The object folders in a folder; those of UCO3D must have both quality scores of at least MIN_SCORE.
-
-    ``rejected``: reason by the name of each folder that is left out.  Raises InputError if no folder remains.
-    """
+    """Object folders in a folder, but those ``rejected`` (name: reason) by UCO3D's quality scores; or InputError."""
 
     def __init__(self, folder: Path, size: int = SIZE):
         reasons = {p.parent: unfit(p.parent) for p in sorted(folder.glob("*/transforms.json"))}
@@ -63,17 +59,10 @@ def capture_views(views: Views, size: int) -> ObjectViews:
     """Square crops around the object, in a frame in which the longest side of its visual hull is 1, as in samples."""
     moved = views.transformed(normalize(views, "hull"))
     cut = moved.resampled(size)
-    valid = torch.stack(
-        [_inside(cut.intrinsics[k], moved.intrinsics[k], moved.masks[k].shape, size) for k in range(len(views))]
-    )
+    cameras = zip(cut.intrinsics, moved.intrinsics, moved.masks, strict=True)
+    at, valid = torch.arange(size, dtype=torch.float32) + 0.5, []
+    for new, old, mask in cameras:  # pixels of the crop that are inside the input image
+        x, y = ((at - new[k]) * (old[k - 2] / new[k - 2]) + old[k] for k in (2, 3))
+        valid.append(((y >= 0) & (y <= mask.shape[0]))[:, None] & ((x >= 0) & (x <= mask.shape[1])))
     background = all(has_background(i, m) for i, m in zip(views.images, views.masks, strict=True))
-    return ObjectViews(cut.images, cut.masks, cut.c2w, cut.intrinsics, background=background, valid=valid)
-
-
-def _inside(new: Tensor, old: Tensor, shape: torch.Size, size: int) -> Tensor:
-    """``(S, S)`` 1 where the crop's pixel is inside the input image of ``shape`` (rows, columns)."""
-    at = torch.arange(size, dtype=torch.float32) + 0.5
-    x = (at - new[2]) * (old[0] / new[0]) + old[2]
-    y = (at - new[3]) * (old[1] / new[1]) + old[3]
-    inside = ((x >= 0) & (x <= shape[1]))[None] & ((y >= 0) & (y <= shape[0]))[:, None]
-    return inside.float()
+    return ObjectViews(cut.images, cut.masks, cut.c2w, cut.intrinsics, background, torch.stack(valid).float())

@@ -1,8 +1,7 @@
 """Configuration of the training stages of the ReLi3D paper (its sections B and C).
 
-Held-out views are compared with renderings of the predicted object: first volume rendering, then its surface under
-spherical Gaussians at increasing resolution, last its surface by Monte Carlo integration with shadows.  Comments mark
-values that the paper does not give.
+Held-out views are compared with renderings of the predicted object: volume rendering, then its surface under spherical
+Gaussians, last by Monte Carlo integration with shadows.  Comments mark values that the paper does not give.
 """
 
 from dataclasses import dataclass, field

@@ -21,10 +21,7 @@ Latents = dict[str, tuple[Tensor, Tensor]]  # of a file's stem: (L, 3) and ()
 
 
 def load_prior(model: Reconstructor, path: Path) -> None:
-    """Loads the environment decoder of a checkpoint of stage ``light_prior`` into ``model`` and freezes it.
-
-    Raises InputError for another file, and if the decoder has other sizes.
-    """
+    """Loads the decoder of a checkpoint of stage ``light_prior`` into ``model`` and freezes it; or InputError."""
     state = load(path)
     if state["stage"] != LightPriorStage.name:
         raise InputError(path, f"expected a checkpoint of stage light_prior, got one of stage {shown(state['stage'])}")
@@ -42,11 +39,7 @@ def fitted(
     steps: int = 200,
     progress: Callable[[str], None] = lambda line: None,
 ) -> Latents:
-    """Fits latents and strength to the lighting of each sample; returns them by the stem of its file.
-
-    cache: safetensors file of earlier results by the hash of the lighting, valid for the same decoder and number of
-    steps; updated.
-    """
+    """Latents and strength of the lighting of samples by the stem of the file.  cache: earlier results, updated."""
     digest = hashlib.sha256(str(steps).encode())
     for name, value in decoder.state_dict().items():
         digest.update(name.encode() + value.cpu().numpy().tobytes())

@@ -1,7 +1,4 @@
-"""Loss terms of the stages of the ReLi3D paper, weighted by :class:`~reli3d.train.stages.config.Weights`.
-
-A term whose ground truth a sample lacks is absent from the result instead of zero.
-"""
+"""Loss terms of the ReLi3D paper's stages; a term whose ground truth a sample lacks is absent instead of zero."""
 
 import os
 from collections.abc import Callable
@@ -32,37 +29,28 @@ def compared_colors(rendering: Rendering, target: ObjectViews, view: int) -> tup
 
 
 def gradients(rendered: Tensor, observed: Tensor) -> Tensor:
-    """Mean absolute error of image gradients of ``(H, W, 3)`` at several scales.
-
-    A substitute for LPIPS without network weights: sensitive to the position of edges, insensitive to constant offsets.
-    """
+    """Mean absolute error of image gradients of ``(H, W, 3)`` at several scales: LPIPS' substitute without weights."""
     error = (rendered - observed).movedim(-1, 0)[None]
     total = error.new_zeros(())
-    for scale in range(SCALES):
-        if scale:
-            if min(error.shape[2:]) < 4:
-                break
-            error = avg_pool2d(error, 2)
+    for _ in range(SCALES):
         total = total + error.diff(dim=2).abs().mean() + error.diff(dim=3).abs().mean()
+        if min(error.shape[2:]) < 4:
+            break
+        error = avg_pool2d(error, 2)
     return total / SCALES
 
 
 def lpips_distance() -> Perceptual:
-    """LPIPS (Zhang et al. 2018) with VGG features, from the package ``lpips``.
-
-    Raises InputError if the package or the weights of VGG are missing; nothing is downloaded.
-    """
+    """LPIPS (Zhang et al. 2018) with VGG features, or InputError if anything is missing; downloads nothing."""
     try:
         import lpips
     except ImportError:
-        raise InputError(
-            "--perceptual", "expected the package lpips, got none; pip install lpips, or use --perceptual gradients"
-        ) from None
+        problem = "expected the package lpips, got none; pip install lpips"
+        raise InputError("--perceptual", f"{problem}, or use --perceptual gradients") from None
     weights = torch.hub.get_dir() + "/checkpoints/vgg16-397923af.pth"
     if not os.access(weights, os.R_OK):
-        raise InputError(
-            "--perceptual", f"expected the weights of VGG16 at {weights}, got none; use --perceptual gradients"
-        )
+        problem = f"expected the weights of VGG16 at {weights}, got none"
+        raise InputError("--perceptual", f"{problem}; use --perceptual gradients")
     network = lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
 
     def distance(rendered: Tensor, observed: Tensor) -> Tensor:
@@ -86,10 +74,7 @@ def mask_error(rendering: Rendering, target: ObjectViews, view: int, *, volume: 
 
 
 def map_terms(rendering: Rendering, target: ObjectViews, view: int) -> dict[str, Tensor]:
-    """Errors of material and normal where both maps have values, weighted by the coverage of the prediction.
-
-    The weight is detached: a wrong material must not reduce the opacity.
-    """
+    """Errors of material and normal where both maps have values, weighted by the detached coverage."""
     terms = {"flat": (1.0 - rendering.bump[:, 2]).mean()} if len(rendering.bump) else {}
     if target.shown is None:
         return terms
@@ -107,12 +92,7 @@ def map_terms(rendering: Rendering, target: ObjectViews, view: int) -> dict[str,
 
 
 def light_terms(latent: Tensor, rotation: Tensor, strength: Tensor, radiance: Tensor, target: ObjectViews) -> dict:
-    """``latent``: mean squared error of the rotated latents and the strength; without ground truth ``neutral``, the
-    mean relative saturation of the lighting.
-
-    latent: ``(L, 3)``.  rotation: ``(3, 3)``.  strength: ``()``.  radiance: ``(K, 3)`` in directions uniform over the
-    sphere.  The prior is equivariant to rotation, so latents with a rotation equal the rotated latents.
-    """
+    """``latent``: squared error of rotated latents and strength; else ``neutral``: saturation of ``radiance``."""
     if target.latent is None or target.strength is None:
         mean = radiance.mean(-1, keepdim=True)
         return {"neutral": (radiance - mean).abs().mean() / mean.detach().mean().clamp(min=1e-3)}

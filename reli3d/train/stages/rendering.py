@@ -15,20 +15,14 @@ DERIVATIVE_AT_WHITE = 1.055 / 2.4  # of the sRGB curve
 
 @dataclass(frozen=True)
 class Rendering:
-    """One view of ``H`` by ``W`` pixels.
+    """One view of ``H`` by ``W`` pixels."""
 
-    color: ``(H, W, 3)`` display values times coverage, above 1 where the surface is brighter than white.  coverage:
-    ``(H, W)``.  known: ``(H, W)`` 1 where the maps have values, else 0.  material: ``(H, W, 5)`` base color (sRGB),
-    roughness, metallic.  normal: ``(H, W, 3)`` shading normal, world, unit.  bump: ``(N, 3)`` predicted tangent-space
-    normals of the N covered pixels.
-    """
-
-    color: Tensor
-    coverage: Tensor
-    known: Tensor
-    material: Tensor
-    normal: Tensor
-    bump: Tensor
+    color: Tensor  # (H, W, 3) display values times coverage, above 1 where the surface is brighter than white
+    coverage: Tensor  # (H, W)
+    known: Tensor  # (H, W) 1 where the maps have values, else 0
+    material: Tensor  # (H, W, 5) base color (sRGB), roughness, metallic
+    normal: Tensor  # (H, W, 3) shading normal, world, unit
+    bump: Tensor  # (N, 3) predicted tangent-space normals of the N covered pixels
 
 
 def display(radiance: Tensor) -> Tensor:
@@ -40,8 +34,7 @@ def display(radiance: Tensor) -> Tensor:
 def lobes(model: Reconstructor, code: Code, count: int) -> SphericalGaussians:
     """The predicted environment as ``count`` equal lobes on a Fibonacci spiral, with the radiance along their axes.
 
-    Constant lighting is reproduced exactly: equal lobes of sharpness s sum to count (1 - exp(-2 s)) / (2 s).
-    Differentiable.  Features smaller than a lobe, such as the sun, are aliased.
+    Constant lighting is exact: equal lobes of sharpness s sum to count (1 - exp(-2 s)) / (2 s).
     """
     k = torch.arange(count, dtype=torch.float64, device=code.latent.device)
     height = 1.0 - 2.0 * (k + 0.5) / count

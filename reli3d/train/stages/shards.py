@@ -1,14 +1,13 @@
 """Folders of training objects, among them WebDataset tar files with one ``<object>.safetensors`` per object."""
 
 import tarfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
-from torch import Tensor
 
 from reli3d.errors import InputError
 from reli3d.io.files import replacing
@@ -19,36 +18,24 @@ OF_VIEWS = ("images", "c2w", "intrinsics", "view_material", "view_normal", "view
 STORED_TENSORS = (*OF_VIEWS, "environment", "finish_known")
 
 
-def to_tensors(views: ObjectViews) -> dict[str, Tensor]:
-    """Tensors stored for a capture, in the layout of :mod:`reli3d.synthetic.samples`."""
+def packed(source: Samples | Captures, index: int) -> tuple[str, bytes]:
+    """Name and file of an object; that of a capture has the layout of :mod:`reli3d.synthetic.samples`."""
+    if isinstance(source, Samples):
+        tensors = load(source.files[index].read_bytes())
+        return source.files[index].stem, save({n: tensors[n] for n in STORED_TENSORS if n in tensors})
+    views = source.load(index, range)
     images = torch.cat([views.images, views.masks[..., None]], -1)
-    stored = {
-        "images": (images * 255 + 0.5).to(torch.uint8),
-        "c2w": views.c2w,
-        "intrinsics": views.intrinsics,
-        "background": torch.tensor(views.background),
-    }
+    stored = {"images": (images * 255 + 0.5).to(torch.uint8), "c2w": views.c2w, "intrinsics": views.intrinsics}
+    stored["background"] = torch.tensor(views.background)
     if views.valid is not None:
         stored["view_valid"] = views.valid.to(torch.uint8)
-    return {k: v.contiguous() for k, v in stored.items()}
-
-
-def _objects(source: Samples | Captures, numbers: Iterable[int]) -> Iterator[tuple[str, bytes]]:
-    for k in numbers:
-        if isinstance(source, Samples):
-            tensors = load(source.files[k].read_bytes())
-            yield source.files[k].stem, save({n: tensors[n] for n in STORED_TENSORS if n in tensors})
-        else:
-            yield source.folders[k].name, save(to_tensors(source.load(k, range)))
+    return source.folders[index].name, save({k: v.contiguous() for k, v in stored.items()})
 
 
 def pack(
     source: Samples | Captures, folder: Path, *, each: int = 64, progress: Callable[[str], None] = lambda line: None
 ) -> None:
-    """Writes the objects of ``source`` to ``NNNNNN.tar``, ``each`` per file; existing files are kept.
-
-    Raises InputError if the package ``webdataset`` is missing.
-    """
+    """Writes the objects of ``source`` to ``NNNNNN.tar``, ``each`` per file; existing files are kept."""
     try:
         from webdataset import TarWriter
     except ImportError:
@@ -60,7 +47,7 @@ def pack(
         if path.exists():
             continue
         with replacing(path) as temporary, TarWriter(str(temporary)) as writer:
-            for name, data in _objects(source, range(first, min(first + each, total))):
+            for name, data in (packed(source, k) for k in range(first, min(first + each, total))):
                 writer.write({"__key__": name, "safetensors": data})
         progress(f"{path.name}: {min(first + each, total)} of {total} objects")
 

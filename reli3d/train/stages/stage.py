@@ -24,18 +24,13 @@ TILE_PIXELS = 96  # pixels of a side of a tile of the image
 
 @dataclass(frozen=True)
 class PaperOptions:
-    """Options of :class:`PaperStage`.
+    """Options of :class:`PaperStage`."""
 
-    max_views: upper limit of the random number of input views; the first is the reference view.  background: fraction
-    of the objects whose input includes the background.  distance: ``gradients`` or ``lpips``, the perceptual term.
-    bfloat16: autocast of the trunk.  checkpointing: recompute the trunk's layers in the backward pass.
-    """
-
-    max_views: int = 4
-    background: float = 0.5
-    distance: str = "gradients"
-    bfloat16: bool = False
-    checkpointing: bool = False
+    max_views: int = 4  # upper limit of the random number of input views; the first is the reference view
+    background: float = 0.5  # fraction of the objects whose input includes the background
+    distance: str = "gradients"  # or ``lpips``, the perceptual term
+    bfloat16: bool = False  # autocast of the trunk
+    checkpointing: bool = False  # recompute the trunk's layers in the backward pass
 
     def __post_init__(self) -> None:
         if not 1 <= self.max_views <= 16:
@@ -63,22 +58,22 @@ class PaperStage(Stage):
         self.settings = {"steps": config.steps, "batch": config.batch, "rate": config.rate}
         self.settings |= {"final_rate": 0.1, "weight_decay": 0.01, "clip": 1.0}
         self.model, self.config, self.sources = model, config, sources
-        self.seed, self.max_views, self.background = seed, options.max_views, options.background
-        self.bfloat16, self.distance = options.bfloat16, lpips_distance() if options.distance == "lpips" else gradients
+        self.seed, self.given = seed, options
+        self.distance = lpips_distance() if options.distance == "lpips" else gradients
         self.configuration = {"config": asdict(config), "folders": list(folders), **asdict(options)}
         if options.checkpointing:
             checkpointed(model)
-        held_out = [validation] * VALIDATION_OBJECTS if validation else []
-        self.held_out = [self.drawn(0, k, [source], patch=0) for k, source in enumerate(held_out)]
+        held_out = [validation] if validation else []
+        self.held_out = [self.drawn(0, k, held_out, patch=0) for k in range(VALIDATION_OBJECTS * len(held_out))]
 
     def drawn(self, step: int, place: int, sources: Sequence[Source] | None = None, patch: int | None = None) -> Draw:
         """The object at position ``place`` of the batch of ``step``; a function of the seed, the step and ``place``."""
         return draw(
             sources or self.sources,
             (self.seed, step, place),
-            inputs=self.max_views,
+            inputs=self.given.max_views,
             targets=self.config.targets,
-            background=self.background,
+            background=self.given.background,
             input_size=self.model.preset.image_size,
             target_size=self.config.image_size,
             patch=self.config.patch if patch is None else patch,
@@ -88,7 +83,7 @@ class PaperStage(Stage):
         return [(step, place) for place in objects]  # loaded one at a time: a batch of images may not fit in memory
 
     def losses(self, item: tuple[int, int]) -> dict[str, Tensor]:
-        return object_losses(self.model, self.drawn(*item), self.config, self.distance, bfloat16=self.bfloat16)
+        return object_losses(self.model, self.drawn(*item), self.config, self.distance, bfloat16=self.given.bfloat16)
 
     @torch.no_grad()
     def measures(self) -> dict[str, float]:
@@ -111,11 +106,7 @@ class PaperStage(Stage):
         for one in self.held_out:
             code = encode(model, one)
             shown, _ = renderings(model, code, one, self.config)
-            target = one.targets
-            tiles = [
-                one.inputs.images[0] * one.inputs.masks[0][..., None],
-                target.images[0] * target.masks[0][..., None],
-            ]
+            tiles = [views.images[0] * views.masks[0][..., None] for views in (one.inputs, one.targets)]
             if shown:
                 rendering = shown[0]
                 coverage = (rendering.coverage * rendering.known)[..., None]
@@ -146,6 +137,5 @@ def averaged(model: Reconstructor, average: dict[str, Tensor]) -> Reconstructor:
 
 def _tile(values: np.ndarray) -> np.ndarray:
     """``values`` resized to TILE_PIXELS by TILE_PIXELS pixels, nearest neighbor, uint8."""
-    at = (np.arange(TILE_PIXELS) * values.shape[0]) // TILE_PIXELS
-    across = (np.arange(TILE_PIXELS) * values.shape[1]) // TILE_PIXELS
-    return (values[at][:, across] * 255 + 0.5).astype(np.uint8)
+    rows, columns = (np.arange(TILE_PIXELS) * size // TILE_PIXELS for size in values.shape[:2])
+    return (values[rows][:, columns] * 255 + 0.5).astype(np.uint8)

@@ -1,7 +1,6 @@
 """The losses of one object in one stage."""
 
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,9 +30,8 @@ def encode(model: Reconstructor, drawn: Draw, *, bfloat16: bool = False) -> Code
     views = drawn.inputs
     shown = torch.tensor([drawn.background_visible], device=views.images.device)
     with torch.autocast(views.images.device.type, torch.bfloat16, enabled=bfloat16):
-        return model.encode(
-            views.images[None], views.masks[None], views.c2w[None], views.intrinsics[None], background_visible=shown
-        )
+        inputs = (t[None] for t in (views.images, views.masks, views.c2w, views.intrinsics))
+        return model.encode(*inputs, background_visible=shown)
 
 
 def shader_of(model: Reconstructor, code: Code, stage: StageConfig, seed: int) -> Shader:
@@ -53,10 +51,7 @@ def shader_of(model: Reconstructor, code: Code, stage: StageConfig, seed: int) -
 def renderings(
     model: Reconstructor, code: Code, drawn: Draw, stage: StageConfig
 ) -> tuple[list[Rendering], dict[str, Tensor]]:
-    """Renderings of the target views, and the regularization terms of the geometry.
-
-    If the field has no surface yet there are no renderings, and the term ``sign`` creates one.
-    """
+    """Renderings of the target views, none without a surface, and the regularization terms of the geometry."""
     target, size = drawn.targets, drawn.targets.images.shape[1]
     cameras = [Camera(target.c2w[v], target.intrinsics[v], size, size) for v in range(len(target))]
     if stage.renderer == "volume":
@@ -73,10 +68,7 @@ def renderings(
 def object_losses(
     model: Reconstructor, drawn: Draw, stage: StageConfig, distance: losses.Perceptual, *, bfloat16: bool = False
 ) -> dict[str, Tensor]:
-    """Unweighted scalar terms of one object, by the names of ``stage.weights``; terms without ground truth are absent.
-
-    Terms of several target views are averaged over the views that have them.
-    """
+    """Unweighted terms of one object by the names of ``stage.weights``, averaged over the views that have them."""
     code = encode(model, drawn, bfloat16=bfloat16)
     shown, terms = renderings(model, code, drawn, stage)
     target = drawn.targets
@@ -104,6 +96,6 @@ def total(terms: dict[str, Tensor], stage: StageConfig) -> Tensor:
 
 def checkpointed(model: Reconstructor) -> None:
     """Enables gradient checkpointing of the layers of the encoders and transformers, in place."""
-    layers: list[Any] = [module for module in model.modules() if isinstance(module, CHECKPOINTED)]
-    for layer in layers:
-        layer.forward = partial(checkpoint, layer.forward, use_reentrant=False)
+    for layer in model.modules():
+        if isinstance(layer, CHECKPOINTED):
+            layer.forward = partial(checkpoint, layer.forward, use_reentrant=False)  # type: ignore[method-assign]

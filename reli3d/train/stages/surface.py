@@ -32,15 +32,12 @@ CHUNK = 1 << 16  # grid points per chunk, whose features are recomputed in the b
 
 @dataclass(frozen=True)
 class Surface:
-    """The surface of one object with its ray tracing structure and edges.
-
-    terms: FlexiCubes' regularizers, by name.
-    """
+    """The surface of one object with its ray tracing structure and edges."""
 
     mesh: Mesh
     scene: RayScene
     edges: Tensor
-    terms: dict[str, Tensor]
+    terms: dict[str, Tensor]  # FlexiCubes' regularizers
 
 
 def query_heads(model: Reconstructor, code: Code, points: Tensor, heads: tuple[str, ...]) -> dict[str, Tensor]:
@@ -58,9 +55,7 @@ def query_heads(model: Reconstructor, code: Code, points: Tensor, heads: tuple[s
 def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None:
     """The surface on a grid of ``resolution`` cubes per side; None if the field has only one sign.
 
-    Gradients reach the network.  The field is first evaluated at all grid points without gradient, then again with
-    gradient at the corners of cubes that the surface crosses: the surface depends on no other points.  Field values are
-    divided by the density threshold.
+    Gradients reach the network: field values, over the density threshold, are evaluated again near the surface.
     """
     radius, threshold = model.preset.radius, model.preset.density_threshold
     axis = torch.linspace(-radius, radius, resolution + 1, device=code.latent.device)
@@ -106,9 +101,7 @@ def seed_surface(model: Reconstructor, code: Code) -> Tensor:
 def render_surface(model: Reconstructor, code: Code, found: Surface, camera: Camera, shader: Shader) -> Rendering:
     """Rendering of one object from ``camera``: one ray per pixel, antialiased silhouettes.
 
-    Gradients reach the network through the head outputs at the hits, through the normals of the mesh and through the
-    silhouettes.  The hit positions are detached: their derivative grows without bound towards the silhouette, and a few
-    grazing pixels would dominate.
+    Gradients reach heads, normals and silhouettes; hit positions are detached: their derivative is unbounded.
     """
     mesh = found.mesh
     hits, _, directions = primary_hits(found.scene, camera)
@@ -120,17 +113,10 @@ def render_surface(model: Reconstructor, code: Code, found: Surface, camera: Cam
     bumped = radial_bump(position, normal, values["normal"])
     bumped = normalize(bumped + normal - normal.detach(), dim=-1)  # gradient to the normal: the frame has none
     wo = -directions.reshape(-1, 3)[seen]
-    material = torch.cat([values["base_color"], values["roughness"], values["metallic"]], -1)
-    points = SurfacePoints(
-        position,
-        normal.detach(),
-        bumped,
-        srgb_to_linear(values["base_color"]),
-        values["roughness"][:, 0],
-        values["metallic"][:, 0],
-    )
+    base, rough, metal = (values[name] for name in MATERIAL[:3])
+    points = SurfacePoints(position, normal.detach(), bumped, srgb_to_linear(base), rough[:, 0], metal[:, 0])
     color = display(shader(points, wo, found.scene))
-    layers = torch.cat([color, torch.ones_like(color[:, :1]), material, bumped], -1)
+    layers = torch.cat([color, torch.ones_like(color[:, :1]), base, rough, metal, bumped], -1)
     full = layers.new_zeros(camera.height * camera.width, layers.shape[1]).index_copy(0, seen, layers)
     full = full.reshape(camera.height, camera.width, -1)
     shown = antialias(full[..., :4].contiguous(), mesh.vertices, mesh.faces, camera, found.scene, edges=found.edges)

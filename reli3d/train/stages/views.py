@@ -1,7 +1,4 @@
-"""Training objects: posed views, with the ground truth that their source has.
-
-Missing ground truth is None and takes part in no loss.
-"""
+"""Training objects: posed views, with the ground truth that their source has; missing ground truth is None."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -120,10 +117,7 @@ def sample_views(read: Callable[[str], Any], choose: Chooser) -> ObjectViews:
 
 
 class Samples:
-    """A folder of ``*.safetensors`` from ``reli3d-data``.
-
-    latents: from :func:`reli3d.train.stages.latents.fitted`, by the stem of a file; None: not known.
-    """
+    """A folder of ``*.safetensors`` from ``reli3d-data``; ``latents``: of :func:`.latents.fitted`, by file stem."""
 
     def __init__(self, folder: Path, latents: dict[str, tuple[Tensor, Tensor]] | None = None):
         self.files, self.latents = sorted(folder.glob("*.safetensors")), latents or {}
@@ -162,27 +156,23 @@ def draw(
     target_size: int,
     patch: int,
 ) -> Draw:
-    """A random object with 1 to ``inputs`` random input views and ``targets`` other views as targets.
+    """A random object with 1 to ``inputs`` random input views and ``targets`` others; a function of seed and sources.
 
-    A function of ``seed`` and the sources alone.  Objects with few views have fewer inputs; a single view is both input
-    and target.  background: probability that the background is visible.  input_size, target_size: pixels per side.
-    patch: side of a random crop of the targets; 0: no crop.
+    Objects with few views have fewer inputs; a single view is both input and target.  background: probability that it
+    is visible.  input_size, target_size: pixels per side.  patch: side of a random crop of the targets; 0: no crop.
     """
-    rng = np.random.default_rng(seed)
-    sizes = [len(s) for s in sources]
-    index = int(rng.integers(sum(sizes)))
+    rng, k = np.random.default_rng(seed), 0
+    ends = np.cumsum([len(s) for s in sources])
+    index = int(rng.integers(ends[-1]))
     read = int(rng.integers(1, inputs + 1))
-    split = [0]
 
     def choose(total: int) -> list[int]:
-        split[0] = max(1, min(read, total - 1))
-        return rng.permutation(total)[: split[0] + targets].tolist()
+        nonlocal k
+        k = max(1, min(read, total - 1))
+        return rng.permutation(total)[: k + targets].tolist()
 
-    which = 0
-    while index >= sizes[which]:
-        index, which = index - sizes[which], which + 1
-    views = sources[which].load(index, choose)
-    k = split[0]
+    which = int(np.searchsorted(ends, index, side="right"))
+    views = sources[which].load(index - int(ends[which]) + len(sources[which]), choose)
     compared = views.select(range(k, len(views)) if len(views) > k else [0]).resized(target_size)
     if patch:
         x, y = rng.integers(target_size - patch + 1, size=2)

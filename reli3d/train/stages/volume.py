@@ -32,10 +32,7 @@ def occupied(model: Reconstructor, code: Code, stage: StageConfig) -> OccupancyG
 
 
 def density_normals(model: Reconstructor, code: Code, points: Tensor) -> Tensor:
-    """Unit normals ``(N, 3)``: the negative gradient of the raw density, by finite differences over a tetrahedron.
-
-    Raw outputs are used because densities vary by orders of magnitude.  No second derivative of the network is needed.
-    """
+    """Unit normals ``(N, 3)``: negative gradient of the raw density, by differences over a tetrahedron."""
     corners = points.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     around = (points[:, None] + GRADIENT_STEP * model.preset.radius * corners).reshape(1, -1, 3)
     raw = model.query(code, around, ("density",))["density"].reshape(-1, 4, 1)
@@ -51,11 +48,7 @@ def render_volume(
     stage: StageConfig,
     seed: int,
 ) -> Rendering:
-    """Rendering of one object from ``camera``, with sample positions jittered along each ray by ``seed``.
-
-    The composited material is shaded at the expected depth, with the normal of :func:`density_normals` perturbed by the
-    predicted bump normal.  Gradients reach the network.
-    """
+    """Rendering of one object from ``camera``, shaded at the expected depth.  seed: of the jittered samples."""
     origins, directions = (r.reshape(-1, 3).contiguous() for r in camera_rays(camera))
     step = 2.0 * model.preset.radius / stage.samples_along
     shift = torch.rand(len(origins), generator=torch.Generator().manual_seed(seed)).clamp(max=0.999999)
