@@ -22,7 +22,10 @@ RESAMPLE_OFFSET = 0.1
 
 
 def camera_vector(c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """The 25 numbers of a view: camera-to-world row by row, then the 3x3 intrinsics over the image ``size``."""
+    """The 25 numbers of a view: camera-to-world row by row, then the 3x3 intrinsics divided by the image size.
+
+    c2w: ``(..., 4, 4)``.  intrinsics: ``(..., 4)`` fx, fy, cx, cy in pixels of an image of ``size`` by ``size``.
+    """
     fx, fy, cx, cy = (intrinsics / size).unbind(-1)
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     normalized = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], dim=-1)

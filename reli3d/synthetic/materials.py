@@ -63,7 +63,10 @@ class Material:
 def evaluate(
     materials: Sequence[Material], points: Tensor, normals: Tensor, part: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Base color, roughness, metallic and bumped normal at ``points`` of material ``part``.  Raises ValueError."""
+    """Base color ``(N, 3)``, roughness, metallic ``(N,)`` and bump-mapped normal ``(N, 3)`` of surface points.
+
+    points, normals: ``(N, 3)`` float32.  part: ``(N,)``, indices of materials.  Raises TypeError or ValueError.
+    """
     check("points", points, shape=(len(part), 3))
     check("normals", normals, shape=(len(part), 3))
     if len(part) and not (int(part.min()) >= 0 and int(part.max()) < len(materials)):
