@@ -64,8 +64,9 @@ class Illumination(nn.Module):
     def forward(self, images: Tensor, extra: Tensor | None, camera: Tensor, planes: Tensor) -> tuple[Tensor, ...]:
         """Latents ``(B, L, 3)``, rotation ``(B, 3, 3)``, strength ``(B,)``, float32.
 
-        images: ``(B, V, S, S, 3)`` sRGB, masked background black.  extra: ``(B, V, K, S, S)``, the mask (1 where
-        the background is visible), if the preset has a mask channel.  camera: ``(B, V, W)``.  planes: ``(B, 3, C, P, P)`` before upsampling.
+        images: ``(B, V, S, S, 3)`` sRGB, masked background black.  extra: ``(B, V, K, S, S)``, if the preset has a mask
+        channel: the mask, or 1 where the background is visible.  camera: ``(B, V, W)``.  planes: ``(B, 3, C, P, P)``
+        before upsampling.
         """
         views = self.encoder(images, camera, extra).flatten(1, 2)
         of_planes = planes.movedim(2, -1).flatten(1, 3)  # plane by plane, row by row
