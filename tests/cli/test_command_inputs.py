@@ -58,43 +58,38 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
+EXAMPLE = [str(infer.EXAMPLE), "--output", "out"]
+RENDER = ["render", "out", "--maps", "maps.npz"]
+
+
+def named(command, start: list[str], options: str) -> list[tuple]:
+    """Cases of a few words each, separated by commas, whose message names the option."""
+    return [(command, [*start, *words.split()], words.split()[0]) for words in options.split(",")]
+
+
 CASES = [
+    *named(render, ["x.glb"], "--samples -1 0 4, --samples 0 0 0, --samples 99999999999 1 1, --seed -1, --size 0"),
+    *named(render, ["x.glb"], "--seed 99999999999999999999, --elevation 90, --azimuth nan, --exposure nan"),
+    *named(render, ["x.glb"], "--distance inf, --device cuda:99"),
     *(
         (render, ["x.glb", *options], word)
         for options, word in [
-            (["--samples", "-1", "0", "4"], "--samples"),
-            (["--samples", "0", "0", "0"], "--samples"),
-            (["--samples", "99999999999", "1", "1"], "--samples"),
-            (["--seed", "-1"], "--seed"),
-            (["--seed", "99999999999999999999"], "--seed"),
             (["--output", "file"], "a file"),
             (["--output", "turn.mov"], "expected a folder or a file of type .png"),
             (["--output", "turn.png", "--frames", "4"], "--frames: expected 1 where --output names one png, got 4"),
             ([], "not found"),
-            (["--size", "0"], "--size"),
-            (["--elevation", "90"], "--elevation"),
-            (["--azimuth", "nan"], "--azimuth"),
-            (["--exposure", "nan"], "--exposure"),
-            (["--distance", "inf"], "--distance"),
             (["--diffuse-model", "white"], "arguments: "),
             (["--output", "a.gif", "--format", "png"], "--format: expected gif"),
-            (["--device", "cuda:99"], "--device"),
             (["--output", "a.mp4", "--size", "47"], "--size: expected an even number"),
         ]
     ),
+    *named(infer, EXAMPLE, "--texture-size 100, --resolution 4, --views 0, --workers 0, --refine -1, --refine 0steps"),
+    *named(infer, EXAMPLE, "--refine soon, --refine-cameras"),
     *(
-        (infer, [str(infer.EXAMPLE), "--output", "out", *options], word)
+        (infer, [*EXAMPLE, *options], word)
         for options, word in [
-            (["--texture-size", "100"], "--texture-size"),
-            (["--resolution", "4"], "--resolution"),
-            (["--views", "0"], "--views"),
-            (["--workers", "0"], "--workers"),
             (["--workers", "2", "--ray", "auto"], "--ray"),
             (["--weights", "nowhere.safetensors"], "nowhere.safetensors"),
-            (["--refine", "-1"], "--refine"),
-            (["--refine", "0steps"], "--refine"),
-            (["--refine", "soon"], "--refine"),
-            (["--refine-cameras"], "--refine-cameras"),
             (["--light", "camera"], "add --refine"),
             (["--no-such-option"], "arguments: "),
             (["--device", "abacus"], "arguments: "),
@@ -105,6 +100,9 @@ CASES = [
     (infer, ["input", "empty", "--output", "out", "--masks", "empty"], "--masks: expected one object"),
     (infer, ["input/transforms.json", "--output", "out"], "got a camera file; give input"),
     (infer, [".", "--output", ".."], "expected a folder other than the working one"),
+    *named(data, RENDER, "--workers 0, --first -5, --count 0, --views 0, --size 0"),
+    *named(data, ["pack", "good", "out"], "--each 0"),
+    (data, ["render", "out", "--maps", "few.npz", "--held-out", "test"], "--maps"),
     *(
         (data, ["render", "out", "--maps", *options], word)
         for options, word in [
@@ -116,13 +114,7 @@ CASES = [
             (["shape.npz"], "env"),
             (["long.npz"], "names"),
             (["/dev/zero"], "regular"),
-            (["few.npz", "--held-out", "test"], "--maps"),
-            (["maps.npz", "--workers", "0"], "--workers"),
-            (["maps.npz", "--first", "-5"], "--first"),
             (["maps.npz", "--first", "999999999", "--count", "2"], "expected seeds below 1000000000, got 1000000000"),
-            (["maps.npz", "--count", "0"], "--count"),
-            (["maps.npz", "--views", "0"], "--views"),
-            (["maps.npz", "--size", "0"], "--size"),
             (["maps.npz", "--meshes", "none.glb"], "not found"),
             (["maps.npz", "--meshes", "empty"], "expected GLB files"),
             (["maps.npz", "--protocol", "paper", "--views", "8"], "--views: expected none"),
@@ -135,20 +127,20 @@ CASES = [
     (data, ["render", "file", "--maps", "maps.npz"], "a file"),
     (data, ["pack", "none", "out"], "none"),
     (data, ["pack", "empty", "out"], "captures"),
-    (data, ["pack", "good", "out", "--each", "0"], "--each"),
+    *named(
+        train, ["good", "out"], "--batch 0, --steps -1, --minutes nan, --points 0, --max-views 0, --rate nan, --seed -1"
+    ),
+    *named(train, ["good", "out", "--stage", "volume"], "--steps -1, --rate nan, --max-views 17"),
+    (train, ["good", "out", "--stage", "light_prior", "--patch", "8"], "--patch"),
+    (train, ["good", "out", "--stage", "pixels", "--image-size", "32"], "--image-size"),
     *(
         (train, ["good", "out", "--stage", *options], word)
         for options, word in [
             (["nothing"], "--stage"),
-            (["volume", "--steps", "-1"], "--steps"),
-            (["volume", "--rate", "nan"], "--rate"),
-            (["volume", "--max-views", "17"], "--max-views"),
             (["volume", "--weights", "none.pt"], "none.pt: file not found"),
             (["volume", "--prior", "file"], "broken file"),
             (["light_prior"], "good: "),
-            (["light_prior", "--patch", "8"], "--patch"),
             (["volume", "--patch", "999"], "patch"),
-            (["pixels", "--image-size", "32"], "--image-size"),
             (["small", "--image-size", "8"], "--image-size: expected none for stage small"),
             (["small", "--lobes", "8"], "--lobes: expected none for stage small"),
             (["volume", "--points", "8"], "--points: expected none for stage volume"),
@@ -170,14 +162,9 @@ CASES = [
     *(
         (train, ["good", "out", *options], word)
         for options, word in [
-            (["--batch", "0"], "--batch"),
-            (["--steps", "-1"], "--steps"),
-            (["--minutes", "nan"], "--minutes"),
-            (["--points", "0"], "--points"),
-            (["--max-views", "0"], "--max-views"),
-            (["--rate", "nan"], "--rate"),
-            (["--seed", "-1"], "--seed"),
             (["--validation", "cut"], "broken file"),
+            (["--weights", "none.pt"], "none.pt: file not found"),
+            (["--weights", "run_noise/state.pt"], "broken file"),
             (["--export", "a/b"], "not found"),
             (["--export", "empty"], "expected a file"),
         ]
@@ -193,6 +180,7 @@ CASES = [
             ("none", "maps.npz", [], "folder of samples"),
             ("named", "maps.npz", [], "seed"),
             ("cut", "maps.npz", [], "broken file"),
+            ("empty", "maps.npz", [], "expected *.safetensors"),
             ("good", "cut.npz", [], "broken file"),
             ("good", "maps.npz", ["--json", "file/x"], "a file"),
             ("good", "maps.npz", ["--json", "good"], "a folder"),
@@ -218,11 +206,11 @@ def test_wrong_input_ends_with_one_line_that_names_it(place, capsys):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-@pytest.mark.parametrize("command, path", [(render, "x.glb"), (infer, infer.EXAMPLE)])
-def test_cuda_that_is_missing_is_reported(command, path, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert command.main([str(path), "--device", "cuda"]) == 2
-    assert "expected a CUDA device" in capsys.readouterr().err
+def test_cuda_that_is_missing_is_reported(place, capsys):
+    trained = [(train, ["good", "out", "--stage", stage]) for stage in ("small", "pixels", "volume")]
+    for command, arguments in [(render, ["x.glb"]), (infer, EXAMPLE), *trained]:
+        assert command.main([*arguments, "--device", "cuda"]) == 2
+        assert "expected a CUDA device" in capsys.readouterr().err
 
 
 def test_a_good_sample_passes_and_each_other_dtype_or_shape_does_not(tmp_path):

@@ -10,7 +10,6 @@ import trimesh
 from reli3d.errors import InputError
 from reli3d.eval import heldout
 from reli3d.eval.heldout import evaluate, light_error, mean_environment, scaled_square_error, square_error, summary
-from reli3d.eval.heldout import table as table_of
 from reli3d.geometry.mesh import Mesh
 from reli3d.nn.weights import load_model
 from reli3d.pipeline import NoSurface
@@ -92,8 +91,3 @@ def test_the_shipped_weights_beat_a_guess_on_an_object(tmp_path):
     assert got["iou"] > 0.6
     assert got["light_error"] < got["mean_light_error"]
     assert 0.0 < got["base_color_scaled_mse"] < 0.1
-
-
-def test_an_empty_folder_is_an_error(tmp_path):
-    with pytest.raises(ValueError, match=r"expected \*.safetensors"):
-        table_of(None, tmp_path, torch.ones(32, 64, 3), (1,), print)
