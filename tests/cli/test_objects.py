@@ -16,7 +16,7 @@ import pytest
 from reli3d.cli import infer, job, objects
 from reli3d.errors import InputError
 from tests.support.checkout import ROOT
-from tests.support.jobs import Start, WordJob
+from tests.support.jobs import Start
 from tests.support.processes import heed_signals
 
 WORDS = ["one", "crash once", "three", "refuse", "crash", "six", "fail", "eight", "nine", "crash once"]
@@ -221,14 +221,6 @@ def test_a_list_names_folders(tmp_path):
     for name, word in (("empty", "got none"), ("bytes", "UTF-8"), ("missing", "not found"), (".", "regular file")):
         with pytest.raises(InputError, match=word):
             objects.listed(tmp_path / name)
-
-
-def test_objects_that_are_all_refused_have_a_summary(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(job, "FolderJob", lambda *_: WordJob(tmp_path / "log"))
-    items = folders(tmp_path, ["refuse", "refuse"])
-    assert infer.main([*(str(i.folder) for i in items), "--output", str(tmp_path / "out")]) == 2
-    assert [r["result"] for r in read_table(tmp_path / "out" / "summary.csv")] == ["refused", "refused"]
-    assert capsys.readouterr().err.count("word: expected another") == 2
 
 
 def test_a_folder_instead_of_the_summary_is_reported_at_once(tmp_path, capsys, monkeypatch):

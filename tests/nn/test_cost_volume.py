@@ -128,3 +128,10 @@ def test_at_initialization_and_outside_the_object_depths_are_those_predicted(ran
         got = found(random_model, views, predicted)
     assert (got == predicted)[views["seen"] == 0].all()
     assert (got != predicted)[inner(views)].float().mean() > 0.9
+
+
+def test_gradients_reach_colors_and_normals(random_model):
+    views = sphere_views(3)
+    inputs = {name: views[name].clone().requires_grad_() for name in ("color", "normal")}
+    found(random_model, {**views, **inputs}, views["truth"]).square().sum().backward()
+    assert all(value.grad.abs().sum() > 0 for value in inputs.values())

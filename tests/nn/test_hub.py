@@ -16,7 +16,6 @@ from reli3d.nn import hub
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.published import KEY_MAP
 from reli3d.nn.weights import WeightsError, load, official_path
-from tests.support.hostile import Bomb
 from tests.support.networks import TINY
 
 huggingface_hub = pytest.importorskip("huggingface_hub")
@@ -170,14 +169,6 @@ def test_no_extra_no_network_and_no_space_are_one_line(server, checkpoint, monke
         patch.setitem(sys.modules, "huggingface_hub", None)
         fails(r"reli3d download needs huggingface_hub: pip install 'reli3d\[hub\]'")
     assert left() == []
-
-
-def test_a_pickle_that_runs_code_does_not_run_and_does_not_stay(server, tmp_path):
-    crater, bomb = tmp_path / "crater", tmp_path / "bomb.ckpt"
-    torch.save({"state_dict": {"system.x": torch.ones(1)}, "hook": Bomb(crater)}, bomb)
-    server.content = bomb.read_bytes()
-    fails("rejected, nothing was run")
-    assert not crater.exists() and left() == []
 
 
 def test_a_manually_copied_checkpoint_needs_no_network_and_stays(server, checkpoint):

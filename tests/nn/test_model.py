@@ -85,6 +85,8 @@ def test_the_field_starts_outside(nano):
     points = torch.rand(1, 500, 3) * 1.7 - 0.85
     density = nano.query(nano.encode(*views(1, 2, 32)), points, ["density"])["density"]
     assert (nano.sdf(density) > 0).all()
+    assert nano.surface_density == pytest.approx(3.302585, abs=1e-6)  # 1 + ln 10
+    assert abs(float(nano.sdf(torch.tensor(nano.surface_density)))) < 1e-5
 
 
 def test_truncated_exp_bounds_its_gradient_only():

@@ -105,11 +105,14 @@ def test_gathered_values_and_gradients_equal_their_float64_reference(device):
     assert reference.rows_within(grads[1], expected_grads[1]) >= 0.999
 
 
-def test_half_of_the_arguments_of_a_surface_is_an_error(device):
+def test_wrong_arguments_are_named(device):
     maps = rig(2, device)
     points, visible, _ = surface(8, 2, device)
     with pytest.raises(ValueError, match="expected both or none"):
         summarize_views(maps.images, maps.camera, points, visible, None)
+    tokens, own = torch.zeros(2, GRID, GRID, 12, device=device), torch.zeros(9, 12, device=device)
+    with pytest.raises(ValueError, match="tokens: expected .* H a multiple of 8, got .2, 4, 4, 12."):
+        pool_views(maps.images, tokens, own, maps.camera, points, None, None)
 
 
 @pytest.mark.parametrize("views", [1, 3, 16])
@@ -136,10 +139,3 @@ def test_the_layer_saturates_as_silu_does(device):
         pooled, _ = pool_views(maps.images, tokens, layer, maps.camera, points, None, None)
         expected = torch.nn.functional.silu(torch.tensor(value, dtype=torch.float64)).item()
         assert pooled.cpu().double().sub(expected).abs().max() < 5e-7 * max(1.0, abs(value))  # bilinear weights: 2 ulp
-
-
-def test_a_layer_that_is_no_whole_number_of_registers_is_an_error(device):
-    maps = rig(2, device)
-    tokens, own = torch.zeros(2, GRID, GRID, 12, device=device), torch.zeros(9, 12, device=device)
-    with pytest.raises(ValueError, match="tokens: expected .* H a multiple of 8, got .2, 4, 4, 12."):
-        pool_views(maps.images, tokens, own, maps.camera, maps.camera.position.contiguous(), None, None)

@@ -19,20 +19,13 @@ from reli3d.nn.weights import load_model
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.latlong import lat_long_directions
 from reli3d.train import checkpoint, small
-from reli3d.train.batches import draw_samples, load_sample
+from reli3d.train import losses as loss_terms
+from reli3d.train.batches import draw_samples, load_sample, random_turn
 from reli3d.train.light_prior import LightPriorStage
 from reli3d.train.loop import parameter_groups, progress, rate_at, train
-from reli3d.train.losses import (
-    MAX_PERTURBATION,
-    PATTERN_FLOOR,
-    WEIGHTS,
-    encode_sample,
-    excess_entropy,
-    losses,
-    pattern_loss,
-    perturbed,
-)
-from reli3d.train.small import FAST_RATE, SmallOptions, SmallStage
+from reli3d.train.losses import encode_sample, excess_entropy, losses, pattern_loss, perturbed
+from reli3d.train.pixels import is_pixel_parameter
+from reli3d.train.small import FAST_RATE, PixelStage, SmallOptions, SmallStage
 from reli3d.train.stage import Options
 from reli3d.train.stages.latents import load_prior
 
@@ -105,7 +98,7 @@ def test_the_pattern_loss_forgives_exposure_and_nothing_else():
     assert float(pattern_loss(darker, target)) < 1e-9
     unrelated = (target.flip(0) - target).square().mean()  # about twice the variance, 0.06; the best factors are near 1
     torch.testing.assert_close(
-        pattern_loss(target.flip(0), target).expm1() * PATTERN_FLOOR, unrelated, rtol=0.5, atol=0
+        pattern_loss(target.flip(0), target).expm1() * loss_terms.PATTERN_FLOOR, unrelated, rtol=0.5, atol=0
     )
 
 
@@ -125,6 +118,14 @@ def test_the_excess_entropy_is_least_at_the_target_and_pulls_from_black_and_whit
     excess_entropy(logit.sigmoid(), torch.full((2, 3), 0.5)).backward()
     # the derivative of the cross-entropy by the logit is the difference of the colors, by the mean over 6 numbers
     torch.testing.assert_close(logit.grad, torch.tensor([-0.5, 0.5]).repeat(3, 1).T / 6, rtol=1e-3, atol=0)
+
+
+def test_turns_are_rotations():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        turn = random_turn(rng)
+        torch.testing.assert_close(turn @ turn.T, torch.eye(3), rtol=0, atol=1e-6)
+        assert float(torch.linalg.det(turn)) > 0
 
 
 def test_a_batch_is_a_function_of_seed_step_and_places_however_it_is_shared(folder):
@@ -163,7 +164,8 @@ def test_every_parameter_is_in_one_group_and_some_learn_faster():
     fast = {id(p) for part in (*heads, model.light.out, model.cost_volume) for p in part.parameters()}
     for p in model.parameters():
         assert times[id(p)] == (FAST_RATE if id(p) in fast else 1.0, 0.02 if p.ndim > 1 else 0.0)
-    slow = {id(p) for name, p in model.pyramid.named_parameters() if not name.startswith("features")}
+    slow = {id(p) for name, p in model.named_parameters() if is_pixel_parameter(name)}
+    assert {id(p) for group in parameter_groups(PixelStage(model, []), 0.02) for p in group["params"]} == slow
     for group in parameter_groups(SmallStage(model, [], SmallOptions(pyramid_rate=0.1)), 0.02):
         for p in group["params"]:
             assert group["times"] == pytest.approx(times[id(p)][0] * (0.1 if id(p) in slow else 1.0))
@@ -177,9 +179,9 @@ def test_training_learns_logs_and_resumes(folder, tmp_path):
     before = losses(stage.model, sample)
     train(stage, options)
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert rows[0]["config"]["stage"] == "small" and rows[-1]["step"] == 12 and set(WEIGHTS) < set(rows[-1])
+    assert rows[0]["config"]["stage"] == "small" and rows[-1]["step"] == 12 and set(loss_terms.WEIGHTS) < set(rows[-1])
     after = losses(stage.model, sample)
-    whole = [float(sum(WEIGHTS[k] * v for k, v in terms.items())) for terms in (before, after)]
+    whole = [float(sum(loss_terms.WEIGHTS[k] * v for k, v in terms.items())) for terms in (before, after)]
     assert whole[1] < 0.7 * whole[0]  # 12 steps on two objects
     again = SmallStage(LocalReconstructor(SMALL), [folder], SmallOptions(1, 256), seed=3)
     train(again, dataclasses.replace(options, steps=13))
@@ -285,5 +287,6 @@ def test_points_go_astray_along_their_normals_as_far_as_stated():
         moved.append(away.square().sum(-1).mean())
         angle.append((n - normal).square().sum(-1).mean())
     # the mean of 400 squares of uniform numbers is known to 4.5 % (standard error 0.30 / sqrt(400) of 1/3): four of it
-    assert abs(float(torch.stack(moved).mean()) / (MAX_PERTURBATION[0] ** 2 / 3) - 1) < 0.18
-    assert abs(float(torch.stack(angle).mean()) / (MAX_PERTURBATION[1] ** 2 / 3) - 1) < 0.18  # chords of small angles
+    assert abs(float(torch.stack(moved).mean()) / (loss_terms.MAX_PERTURBATION[0] ** 2 / 3) - 1) < 0.18
+    # chords of small angles
+    assert abs(float(torch.stack(angle).mean()) / (loss_terms.MAX_PERTURBATION[1] ** 2 / 3) - 1) < 0.18
