@@ -1,11 +1,11 @@
-"""Invalid input of ``reli3d-infer``, ``-render``, ``-data``, ``-train``, ``-eval``: one line, exit code 2, no work."""
+"""Invalid input of the commands: one line, exit code 2, no work."""
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
-from reli3d.cli import data, infer, render, train
+from reli3d.cli import data, export, infer, render, train
 from reli3d.cli import eval as evaluation
 from reli3d.errors import InputError
 from reli3d.synthetic.stored import OPTIONAL, TENSORS, check_sample
@@ -38,10 +38,8 @@ def place(tmp_path, monkeypatch):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("no maps")
     names = [str(k) for k in range(8)]
-    np.savez(tmp_path / "maps.npz", env=np.ones((8, 4, 8, 3), np.float32), names=names)
-    np.savez(tmp_path / "few.npz", env=np.ones((2, 4, 8, 3), np.float32), names=names[:2])
-    np.savez(tmp_path / "long.npz", env=np.ones((2, 4, 8, 3), np.float32), names=names)
-    np.savez(tmp_path / "shape.npz", env=np.ones((8, 4, 4, 3), np.float32), names=names)
+    for name, count, width, named in (("maps", 8, 8, 8), ("few", 2, 8, 2), ("long", 2, 8, 8), ("shape", 8, 4, 8)):
+        np.savez(tmp_path / f"{name}.npz", env=np.ones((count, 4, width, 3), np.float32), names=names[:named])
     np.savez(tmp_path / "key.npz", maps=np.ones((8, 4, 8, 3), np.float32))
     np.savez(tmp_path / "pickle.npz", env=np.array([{}], dtype=object), names=names)
     np.save(tmp_path / "array.npy", np.ones((8, 4, 8, 3), np.float32))
@@ -125,6 +123,8 @@ CASES = [
         ]
     ),
     (data, ["render", "file", "--maps", "maps.npz"], "a file"),
+    *named(export, ["x.glb"], "--decimate 3, --texture-size 9"),
+    (export, ["x.glb", "--format", "obj", "--textures", "webp"], "--textures: expected png"),
     (data, ["pack", "none", "out"], "none"),
     (data, ["pack", "empty", "out"], "captures"),
     *named(

@@ -139,20 +139,6 @@ def test_textures_are_transferred_within_a_fraction_of_the_size():
     assert bool((lower.textures.base_color[uv[:, 1], uv[:, 0]] > 0.9).all())
 
 
-@pytest.mark.parametrize(
-    "words, text",
-    [
-        (["--decimate", "3"], "--decimate: expected 16"),
-        (["--texture-size", "9"], "--texture-size: expected 64"),
-        (["--format", "obj", "--textures", "webp"], "--textures: expected png"),
-    ],
-)
-def test_what_makes_no_sense_ends_with_2(glb, tmp_path, capsys, words, text):
-    assert main([str(glb), *words, "--output", str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err.startswith(f"reli3d export: {text}")
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_missing_extra_is_one_line(glb, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     assert main([str(glb), "--format", "usdz", "--output", str(tmp_path / "out")]) == 2
