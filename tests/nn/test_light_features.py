@@ -41,9 +41,8 @@ def test_unobserved_points_have_no_weight():
     color = 0.5 + 0.3 * n[:, 1:2].expand(-1, 3)
     visible = (n[:, 1] > 0).float()
     spoilt = torch.where(visible[:, None] > 0, color, torch.full_like(color, 7.0))
-    torch.testing.assert_close(
-        brightness_over_normal(spoilt, visible, n), brightness_over_normal(color, visible, n), rtol=1e-3, atol=1e-3
-    )
+    got, expected = (brightness_over_normal(c, visible, n) for c in (spoilt, color))
+    torch.testing.assert_close(got, expected, rtol=1e-3, atol=1e-3)
 
 
 def test_nothing_seen_and_black_give_one():
