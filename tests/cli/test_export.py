@@ -37,12 +37,8 @@ def glb(tmp_path_factory):
 
 
 def test_every_format_is_written_and_named(glb, tmp_path, capsys):
-    names = {
-        "glb": {"mesh.glb"},
-        "usdz": {"mesh.usdz"},
-        "obj": {"mesh.obj", "mesh.mtl", *(f"mesh_{k}.png" for k in ("base_color", "roughness", "metallic", "normal"))},
-    }
-    for kind, expected in names.items():
+    maps = {f"mesh_{k}.png" for k in ("base_color", "roughness", "metallic", "normal")}
+    for kind, expected in (("glb", {"mesh.glb"}), ("usdz", {"mesh.usdz"}), ("obj", {"mesh.obj", "mesh.mtl", *maps})):
         if kind == "usdz":
             pytest.importorskip("pxr", reason="needs usd-core")
         assert main([str(glb), "--format", kind, "--output", str(tmp_path / kind), "--json"]) == 0

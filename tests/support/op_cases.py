@@ -72,11 +72,8 @@ def units(n: int, seed: int = 0) -> Tensor:
 
 def above(n: int, seed: int = 0) -> Tensor:
     """Unit directions at least 0.1 above the horizon of +z."""
-    return normalize(
-        units(n, seed) * torch.tensor([1.0, 1.0, 0.0], **HOST)
-        + uniform(n, 1, seed=seed + 50, low=0.15, high=2.0) * torch.tensor([0.0, 0.0, 1.0], **HOST),
-        dim=-1,
-    )
+    height = uniform(n, 1, seed=seed + 50, low=0.15, high=2.0)
+    return normalize(torch.cat([units(n, seed)[:, :2], height], 1), dim=-1)
 
 
 def numbers(n: int) -> Tensor:
@@ -136,14 +133,9 @@ def rig(device, width: int = 20, height: int = 24) -> Camera:
 
 
 def shaded(n: int) -> dict[str, Tensor]:
-    normal = units(n, 1)
-    return {
-        "normal": normal,
-        "base_color": uniform(n, 3, seed=2, low=0.1),
-        "metallic": uniform(n, seed=4),
-        "roughness": uniform(n, seed=3, low=0.2),
-        "radiance": uniform(8, 16, 3, seed=5) ** 3 * 2.0,
-    }
+    finish = {"metallic": uniform(n, seed=4), "roughness": uniform(n, seed=3, low=0.2)}
+    radiance = uniform(8, 16, 3, seed=5) ** 3 * 2.0
+    return {"normal": units(n, 1), "base_color": uniform(n, 3, seed=2, low=0.1), **finish, "radiance": radiance}
 
 
 def lit(shadows: str | None = None, **options):
@@ -185,13 +177,11 @@ def grid_inputs(_, shape=(7, 6, 8), seed: int = 3) -> dict[str, Tensor]:
     sdf = torch.nn.functional.pad(torch.randn(shape, generator=rng(seed), **HOST), (1,) * 6, value=0.7)
     sdf = sdf + 0.2 * sdf.sign()  # no crossing next to a grid point, where gradients are unbounded
     cubes = (sdf.shape[0] - 1) * (sdf.shape[1] - 1) * (sdf.shape[2] - 1)
-    return {
-        "sdf": sdf,
-        "deformation": uniform(*sdf.shape, 3, seed=4, low=-0.02, high=0.02),
-        "alpha": uniform(cubes, 8, seed=5, low=0.5),
-        "beta": uniform(cubes, 12, seed=6, low=0.5),
-        "gamma": uniform(cubes, seed=7, low=0.5),
-    }
+    deformation = uniform(*sdf.shape, 3, seed=4, low=-0.02, high=0.02)
+    alpha, beta, gamma = (
+        uniform(*size, seed=k, low=0.5) for size, k in (((cubes, 8), 5), ((cubes, 12), 6), ((cubes,), 7))
+    )
+    return {"sdf": sdf, "deformation": deformation, "alpha": alpha, "beta": beta, "gamma": gamma}
 
 
 def surface(sdf, deformation, alpha, beta, gamma):
@@ -227,13 +217,9 @@ def bsdf(diffuse_model):
 
 
 def bsdf_inputs(n):
-    return {
-        "wo": above(n, 1),
-        "wi": above(n, 2),
-        "base_color": uniform(n, 3, seed=3),
-        "alpha": uniform(n, seed=4, low=0.1),
-        "metallic": uniform(n, seed=5),
-    }
+    directions = {"wo": above(n, 1), "wi": above(n, 2)}
+    finish = {"alpha": uniform(n, seed=4, low=0.1), "metallic": uniform(n, seed=5)}
+    return {**directions, "base_color": uniform(n, 3, seed=3), **finish}
 
 
 def traced(backend):
