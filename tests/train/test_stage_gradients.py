@@ -1,10 +1,9 @@
 """The gradient of each stage's whole loss on one object against central differences.
 
-The random numbers are the same on both sides.  Values that are detached by design are fixed: materials are
-evaluated at detached points, the frames of bumps have no gradient, densities of samples are detached.  So light samples
-are taken where the material moves, cosine samples alone where the light does, and where the geometry moves the
-materials are even and the bumps are flat.  Colors at outlines go from pixel to pixel by jumps, which only a wide step
-averages, and a normal is not evaluated at the moved surface: the gradient of a surface agrees to 15 percent.
+The random numbers are the same on both sides.  Points of materials, frames of bumps and densities of samples are
+detached by design: light samples where the material moves, cosine samples alone where the light does, even materials
+and flat bumps where the geometry does.  Colors at outlines jump from pixel to pixel, and a normal is not evaluated at
+the moved surface: the gradient of a surface agrees to 15 percent.
 """
 
 from dataclasses import replace
@@ -59,8 +58,8 @@ def one(tmp_path_factory):
 def test_the_whole_loss_has_the_gradient_of_central_differences(case, one, monkeypatch):
     stage, names, size, tolerance = CASES[case]
     model = ball_model()
-    for head in ("normal", *(MATERIAL_HEADS if names is SHAPE else ())):
-        model.heads[head][-1].weight.data.zero_()
+    for head in ("heads.normal", *(MATERIAL if names is SHAPE else ())):
+        model.heads[head.removeprefix("heads.")][-1].weight.data.zero_()
     model.heads["normal"][-1].bias.data.zero_()
     if names is SHAPE:
         grid = stage_step.occupied  # the choice of cells is not differentiated
@@ -76,9 +75,6 @@ def test_the_whole_loss_has_the_gradient_of_central_differences(case, one, monke
 
     got, expected = directional_derivatives(loss, moved, directions, size)
     assert got == pytest.approx(expected, rel=tolerance)
-
-
-MATERIAL_HEADS = ("base_color", "roughness", "metallic")
 
 
 def test_all_terms_are_in_the_gradient(one):

@@ -27,7 +27,6 @@ from tests.support.processes import ENVIRONMENT
 from tests.support.stages import BallModel, ball_model, numbers, rows
 
 GAUSSIANS = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, steps=6, rate=1e-3)
-SIZES = dict(inputs=2, targets=1, background=0.5, input_size=32, target_size=16, patch=0)
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +174,7 @@ def test_a_stage_of_the_surface_ends_at_once_without_one(folder, tmp_path, capsy
 
 def test_checkpointing_and_bfloat16_keep_the_loss(folder):
     """Checkpointing computes the same; bfloat16 has eight bits, so the loss moves by some thousandths."""
-    one = draw([Samples(folder)], (0, 1), **SIZES)
+    one = draw([Samples(folder)], (0, 1), inputs=2, targets=1, background=0.5, input_size=32, target_size=16, patch=0)
     results = []
     for again, half in ((False, False), (True, False), (False, True)):
         model = ball_model()

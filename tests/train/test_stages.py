@@ -61,10 +61,7 @@ def test_a_draw_is_a_function_of_its_seed_and_compares_unread_views(source):
 
 def test_a_window_looks_through_the_same_pixels(one):
     part = one.targets.window(5, 3, 8)
-    whole, cut = (
-        camera_rays(Camera(v.c2w[0], v.intrinsics[0], v.images.shape[1], v.images.shape[1]))[1]
-        for v in (one.targets, part)
-    )
+    whole, cut = (camera_rays(Camera(v.c2w[0], v.intrinsics[0], *v.images.shape[1:3]))[1] for v in (one.targets, part))
     torch.testing.assert_close(cut, whole[3:11, 5:13], rtol=0, atol=1e-6)
     assert torch.equal(part.images[0], one.targets.images[0, 3:11, 5:13])
 
