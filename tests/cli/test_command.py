@@ -1,19 +1,8 @@
 """``reli3d``: every command by its name."""
 
-import re
-
 import pytest
 
 from reli3d.cli import doctor, main
-
-
-def test_help_names_every_command_and_the_old_names(capsys):
-    assert main.main([]) == 0
-    text = capsys.readouterr().out
-    for name in ("infer", "check", "render", "download", "data", "train", "eval", "tables", "doctor"):
-        assert re.search(rf"^  {name} ", text, re.MULTILINE)
-    for name in ("infer", "render", "data", "train", "eval", "tables"):
-        assert f"reli3d-{name}" in text
 
 
 @pytest.mark.parametrize("name", [*main.COMMANDS, "data render", "data pack"])
@@ -27,6 +16,9 @@ def test_every_command_has_its_help_with_defaults(name, capsys):
 
 
 def test_options_reach_the_command_and_so_does_its_exit_code(monkeypatch, tmp_path, capsys):
+    assert main.main([]) == 0
+    text = capsys.readouterr().out
+    assert all(f"\n  {name} " in text for name in main.COMMANDS)
     monkeypatch.setattr(doctor, "examine", lambda: ([("state", "ill")], False))
     assert main.main(["doctor"]) == 1 and capsys.readouterr().out.split() == ["state", "ill"]
     assert main.main(["check", str(tmp_path), "--output", str(tmp_path)]) == 2  # not an object folder

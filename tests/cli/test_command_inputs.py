@@ -1,11 +1,11 @@
-"""Invalid input of ``reli3d-infer``, ``-render``, ``-data``, ``-train``, ``-eval``: one line, exit code 2, no work."""
+"""Invalid input of the commands: one line, exit code 2, no work."""
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
-from reli3d.cli import data, infer, render, train
+from reli3d.cli import data, export, infer, render, train
 from reli3d.cli import eval as evaluation
 from reli3d.errors import InputError
 from reli3d.synthetic.stored import OPTIONAL, TENSORS, check_sample
@@ -36,12 +36,11 @@ def place(tmp_path, monkeypatch):
         (tmp_path / name).mkdir()
         (tmp_path / name / "0000000003.safetensors").write_bytes(part)
     (tmp_path / "empty").mkdir()
+    (tmp_path / "example").symlink_to(infer.EXAMPLE)
     (tmp_path / "file").write_text("no maps")
     names = [str(k) for k in range(8)]
-    np.savez(tmp_path / "maps.npz", env=np.ones((8, 4, 8, 3), np.float32), names=names)
-    np.savez(tmp_path / "few.npz", env=np.ones((2, 4, 8, 3), np.float32), names=names[:2])
-    np.savez(tmp_path / "long.npz", env=np.ones((2, 4, 8, 3), np.float32), names=names)
-    np.savez(tmp_path / "shape.npz", env=np.ones((8, 4, 4, 3), np.float32), names=names)
+    for name, count, width, named in (("maps", 8, 8, 8), ("few", 2, 8, 2), ("long", 2, 8, 8), ("shape", 8, 4, 8)):
+        np.savez(tmp_path / f"{name}.npz", env=np.ones((count, 4, width, 3), np.float32), names=names[:named])
     np.savez(tmp_path / "key.npz", maps=np.ones((8, 4, 8, 3), np.float32))
     np.savez(tmp_path / "pickle.npz", env=np.array([{}], dtype=object), names=names)
     np.save(tmp_path / "array.npy", np.ones((8, 4, 8, 3), np.float32))
@@ -58,148 +57,83 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
+def cases(command, start: str, calls: str, word: str = "") -> list[tuple]:
+    """Calls that continue ``start``, separated by commas, and the word of their message: if none, their first word."""
+    found = [call.split() for call in calls.split(",")]
+    return [(command, [*start.split(), *call], word or call[0]) for call in found]
+
+
+EXAMPLE, MAPS, GOOD = "example --output out", "render out --maps", "good out"
 CASES = [
-    *(
-        (render, ["x.glb", *options], word)
-        for options, word in [
-            (["--samples", "-1", "0", "4"], "--samples"),
-            (["--samples", "0", "0", "0"], "--samples"),
-            (["--samples", "99999999999", "1", "1"], "--samples"),
-            (["--seed", "-1"], "--seed"),
-            (["--seed", "99999999999999999999"], "--seed"),
-            (["--output", "file"], "a file"),
-            (["--output", "turn.mov"], "expected a folder or a file of type .png"),
-            (["--output", "turn.png", "--frames", "4"], "--frames: expected 1 where --output names one png, got 4"),
-            ([], "not found"),
-            (["--size", "0"], "--size"),
-            (["--elevation", "90"], "--elevation"),
-            (["--azimuth", "nan"], "--azimuth"),
-            (["--exposure", "nan"], "--exposure"),
-            (["--distance", "inf"], "--distance"),
-            (["--diffuse-model", "white"], "arguments: "),
-            (["--output", "a.gif", "--format", "png"], "--format: expected gif"),
-            (["--device", "cuda:99"], "--device"),
-            (["--output", "a.mp4", "--size", "47"], "--size: expected an even number"),
-        ]
-    ),
-    *(
-        (infer, [str(infer.EXAMPLE), "--output", "out", *options], word)
-        for options, word in [
-            (["--texture-size", "100"], "--texture-size"),
-            (["--resolution", "4"], "--resolution"),
-            (["--views", "0"], "--views"),
-            (["--workers", "0"], "--workers"),
-            (["--workers", "2", "--ray", "auto"], "--ray"),
-            (["--weights", "nowhere.safetensors"], "nowhere.safetensors"),
-            (["--refine", "-1"], "--refine"),
-            (["--refine", "0steps"], "--refine"),
-            (["--refine", "soon"], "--refine"),
-            (["--refine-cameras"], "--refine-cameras"),
-            (["--light", "camera"], "add --refine"),
-            (["--no-such-option"], "arguments: "),
-            (["--device", "abacus"], "arguments: "),
-            (["--views", "many"], "arguments: "),
-        ]
-    ),
-    (infer, ["input", "--output", "."], "mesh.glb would be replaced"),
-    (infer, ["input", "empty", "--output", "out", "--masks", "empty"], "--masks: expected one object"),
-    (infer, ["input/transforms.json", "--output", "out"], "got a camera file; give input"),
-    (infer, [".", "--output", ".."], "expected a folder other than the working one"),
-    *(
-        (data, ["render", "out", "--maps", *options], word)
-        for options, word in [
-            (["none.npz"], "not found"),
-            (["file"], "broken file"),
-            (["cut.npz"], "broken file"),
-            (["key.npz"], "env"),
-            (["pickle.npz"], "broken file"),
-            (["shape.npz"], "env"),
-            (["long.npz"], "names"),
-            (["/dev/zero"], "regular"),
-            (["few.npz", "--held-out", "test"], "--maps"),
-            (["maps.npz", "--workers", "0"], "--workers"),
-            (["maps.npz", "--first", "-5"], "--first"),
-            (["maps.npz", "--first", "999999999", "--count", "2"], "expected seeds below 1000000000, got 1000000000"),
-            (["maps.npz", "--count", "0"], "--count"),
-            (["maps.npz", "--views", "0"], "--views"),
-            (["maps.npz", "--size", "0"], "--size"),
-            (["maps.npz", "--meshes", "none.glb"], "not found"),
-            (["maps.npz", "--meshes", "empty"], "expected GLB files"),
-            (["maps.npz", "--protocol", "paper", "--views", "8"], "--views: expected none"),
-            (["maps.npz", "--protocol", "paper", "--held-out", "test"], "expected at least 3 for --protocol paper"),
-            (["maps.npz", "--workers", "2", "--ray", "auto"], "not allowed with"),
-            (["maps.npz", "--meshes", "a.glb", "--shapes", "b.glb"], "not allowed with"),
-            (["array.npy"], "broken file"),
-        ]
-    ),
-    (data, ["render", "file", "--maps", "maps.npz"], "a file"),
-    (data, ["pack", "none", "out"], "none"),
-    (data, ["pack", "empty", "out"], "captures"),
-    (data, ["pack", "good", "out", "--each", "0"], "--each"),
-    *(
-        (train, ["good", "out", "--stage", *options], word)
-        for options, word in [
-            (["nothing"], "--stage"),
-            (["volume", "--steps", "-1"], "--steps"),
-            (["volume", "--rate", "nan"], "--rate"),
-            (["volume", "--max-views", "17"], "--max-views"),
-            (["volume", "--weights", "none.pt"], "none.pt: file not found"),
-            (["volume", "--prior", "file"], "broken file"),
-            (["light_prior"], "good: "),
-            (["light_prior", "--patch", "8"], "--patch"),
-            (["volume", "--patch", "999"], "patch"),
-            (["pixels", "--image-size", "32"], "--image-size"),
-            (["small", "--image-size", "8"], "--image-size: expected none for stage small"),
-            (["small", "--lobes", "8"], "--lobes: expected none for stage small"),
-            (["volume", "--points", "8"], "--points: expected none for stage volume"),
-        ]
-    ),
-    *(
-        (train, [folder, "out"], word)
-        for folder, word in [
-            ("none", "folder of samples"),
-            ("file", "folder of samples"),
-            ("empty", "got none"),
-            ("lacks", "points"),
-            ("few", "c2w"),
-            ("cut", "broken file"),
-            ("nothing", "broken file"),
-            ("noise", "broken file"),
-        ]
-    ),
-    *(
-        (train, ["good", "out", *options], word)
-        for options, word in [
-            (["--batch", "0"], "--batch"),
-            (["--steps", "-1"], "--steps"),
-            (["--minutes", "nan"], "--minutes"),
-            (["--points", "0"], "--points"),
-            (["--max-views", "0"], "--max-views"),
-            (["--rate", "nan"], "--rate"),
-            (["--seed", "-1"], "--seed"),
-            (["--validation", "cut"], "broken file"),
-            (["--export", "a/b"], "not found"),
-            (["--export", "empty"], "expected a file"),
-        ]
-    ),
-    (train, ["good", "file"], "a file"),
-    (train, ["good", "run_list"], "another file"),
-    (train, ["good", "run_noise"], "broken file"),
-    (train, ["good", "run_other"], "run_other/state.pt"),
-    (train, ["good", "run_noise", "--export", "x.safetensors"], "broken file"),
-    *(
-        (evaluation, [folder, "--maps", maps, *options], word)
-        for folder, maps, options, word in [
-            ("none", "maps.npz", [], "folder of samples"),
-            ("named", "maps.npz", [], "seed"),
-            ("cut", "maps.npz", [], "broken file"),
-            ("good", "cut.npz", [], "broken file"),
-            ("good", "maps.npz", ["--json", "file/x"], "a file"),
-            ("good", "maps.npz", ["--json", "good"], "a folder"),
-            ("good", "maps.npz", ["--weights", "none"], "none"),
-            ("good", "maps.npz", ["--views", "8"], "expected at least 16, got 12"),
-        ]
-    ),
+    *cases(render, "x.glb", "--samples -1 0 4, --samples 0 0 0, --samples 99999999999 1 1, --seed -1, --size 0"),
+    *cases(render, "x.glb", "--seed 99999999999999999999, --elevation 90, --azimuth nan, --exposure nan"),
+    *cases(render, "x.glb", "--distance inf, --device cuda:99"),
+    *cases(render, "", "x.glb", "not found"),
+    *cases(render, "x.glb", "--output file", "a file"),
+    *cases(render, "x.glb", "--output turn.mov", "expected a folder or a file of type .png"),
+    *cases(render, "x.glb --output turn.png", "--frames 4", "--frames: expected 1 where --output names one png, got 4"),
+    *cases(render, "x.glb", "--diffuse-model white", "arguments: "),
+    *cases(render, "x.glb", "--output a.gif --format png", "--format: expected gif"),
+    *cases(render, "x.glb", "--output a.mp4 --size 47", "--size: expected an even number"),
+    *cases(infer, EXAMPLE, "--texture-size 100, --resolution 4, --views 0, --workers 0, --refine -1, --refine 0steps"),
+    *cases(infer, EXAMPLE, "--refine soon, --refine-cameras"),
+    *cases(infer, f"{EXAMPLE} --workers 2", "--ray auto"),
+    *cases(infer, EXAMPLE, "--weights nowhere.safetensors", "nowhere.safetensors"),
+    *cases(infer, EXAMPLE, "--light camera", "add --refine"),
+    *cases(infer, EXAMPLE, "--no-such-option, --device abacus, --views many", "arguments: "),
+    *cases(infer, "input", "--output .", "mesh.glb would be replaced"),
+    *cases(infer, "input empty --output out", "--masks empty", "--masks: expected one object"),
+    *cases(infer, "input/transforms.json", "--output out", "got a camera file; give input"),
+    *cases(infer, ".", "--output ..", "expected a folder other than the working one"),
+    *cases(data, f"{MAPS} maps.npz", "--workers 0, --first -5, --count 0, --views 0, --size 0"),
+    *cases(data, MAPS, "few.npz --held-out test", "--maps"),
+    *cases(data, MAPS, "none.npz, maps.npz --meshes none.glb", "not found"),
+    *cases(data, MAPS, "file, cut.npz, pickle.npz, array.npy", "broken file"),
+    *cases(data, MAPS, "key.npz, shape.npz", "env"),
+    *cases(data, MAPS, "long.npz", "names"),
+    *cases(data, MAPS, "/dev/zero", "regular"),
+    *cases(data, MAPS, "maps.npz --first 999999999 --count 2", "expected seeds below 1000000000, got 1000000000"),
+    *cases(data, MAPS, "maps.npz --meshes empty", "expected GLB files"),
+    *cases(data, MAPS, "maps.npz --protocol paper --views 8", "--views: expected none"),
+    *cases(data, MAPS, "maps.npz --protocol paper --held-out test", "expected at least 3 for --protocol paper"),
+    *cases(data, MAPS, "maps.npz --workers 2 --ray auto, maps.npz --meshes a.glb --shapes b.glb", "not allowed with"),
+    *cases(data, "render", "file --maps maps.npz", "a file"),
+    *cases(data, "pack good out", "--each 0"),
+    *cases(data, "pack", "none out"),
+    *cases(data, "pack", "empty out", "captures"),
+    *cases(export, "x.glb", "--decimate 3, --texture-size 9"),
+    *cases(export, "x.glb", "--format obj --textures webp", "--textures: expected png"),
+    *cases(train, GOOD, "--batch 0, --steps -1, --minutes nan, --points 0, --max-views 0, --rate nan, --seed -1"),
+    *cases(train, f"{GOOD} --stage volume", "--steps -1, --rate nan, --max-views 17"),
+    *cases(train, f"{GOOD} --stage light_prior", "--patch 8"),
+    *cases(train, f"{GOOD} --stage pixels", "--image-size 32"),
+    *cases(train, GOOD, "--stage nothing"),
+    *cases(train, GOOD, "--stage light_prior", "good: "),
+    *cases(train, f"{GOOD} --stage volume", "--patch 999", "patch"),
+    *cases(train, f"{GOOD} --stage small", "--image-size 8", "--image-size: expected none for stage small"),
+    *cases(train, f"{GOOD} --stage small", "--lobes 8", "--lobes: expected none for stage small"),
+    *cases(train, f"{GOOD} --stage volume", "--points 8", "--points: expected none for stage volume"),
+    *cases(train, GOOD, "--stage volume --weights none.pt, --weights none.pt", "none.pt: file not found"),
+    *cases(train, GOOD, "--stage volume --prior file, --validation cut, --weights run_noise/state.pt", "broken file"),
+    *cases(train, GOOD, "--export a/b", "not found"),
+    *cases(train, GOOD, "--export empty", "expected a file"),
+    *cases(train, "", "none out, file out", "folder of samples"),
+    *cases(train, "", "empty out", "got none"),
+    *cases(train, "", "lacks out", "points"),
+    *cases(train, "", "few out", "c2w"),
+    *cases(train, "", "cut out, nothing out, noise out", "broken file"),
+    *cases(train, "good", "run_noise, run_noise --export x.safetensors", "broken file"),
+    *cases(train, "good", "file", "a file"),
+    *cases(train, "good", "run_list", "another file"),
+    *cases(train, "good", "run_other", "run_other/state.pt"),
+    *cases(evaluation, "", "none --maps maps.npz", "folder of samples"),
+    *cases(evaluation, "", "named --maps maps.npz", "seed"),
+    *cases(evaluation, "", "cut --maps maps.npz, good --maps cut.npz", "broken file"),
+    *cases(evaluation, "", "empty --maps maps.npz", "expected *.safetensors"),
+    *cases(evaluation, "good --maps maps.npz", "--json file/x", "a file"),
+    *cases(evaluation, "good --maps maps.npz", "--json good", "a folder"),
+    *cases(evaluation, "good --maps maps.npz", "--weights none", "none"),
+    *cases(evaluation, "good --maps maps.npz", "--views 8", "expected at least 16, got 12"),
 ]
 
 
@@ -218,11 +152,11 @@ def test_wrong_input_ends_with_one_line_that_names_it(place, capsys):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-@pytest.mark.parametrize("command, path", [(render, "x.glb"), (infer, infer.EXAMPLE)])
-def test_cuda_that_is_missing_is_reported(command, path, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert command.main([str(path), "--device", "cuda"]) == 2
-    assert "expected a CUDA device" in capsys.readouterr().err
+def test_cuda_that_is_missing_is_reported(place, capsys):
+    trained = [(train, f"{GOOD} --stage {stage}") for stage in ("small", "pixels", "volume")]
+    for command, start in [(render, "x.glb"), (infer, EXAMPLE), *trained]:
+        assert command.main([*start.split(), "--device", "cuda"]) == 2
+        assert "expected a CUDA device" in capsys.readouterr().err
 
 
 def test_a_good_sample_passes_and_each_other_dtype_or_shape_does_not(tmp_path):

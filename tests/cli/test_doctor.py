@@ -66,10 +66,8 @@ def test_a_part_that_fails_is_reported_and_the_rest_continues(assets, monkeypatc
 def test_missing_package_is_a_problem(assets, monkeypatch):
     monkeypatch.setattr(doctor.metadata, "requires", lambda _: ["no-such-package-of-reli3d>=1", "x; extra == 'y'"])
     rows, usable = doctor.examine()
-    assert [v for _, v in rows if "pip" in v] == [
-        f"{doctor.PROBLEM}not installed: pip install no-such-package-of-reli3d"
-    ]
-    assert not usable
+    (found,) = [v for _, v in rows if "pip" in v]
+    assert found == f"{doctor.PROBLEM}not installed: pip install no-such-package-of-reli3d" and not usable
 
 
 def test_a_checkout_that_is_not_installed_is_usable(monkeypatch):
@@ -79,11 +77,6 @@ def test_a_checkout_that_is_not_installed_is_usable(monkeypatch):
     monkeypatch.setattr(doctor.metadata, "requires", absent)
     rows, usable = doctor.examine()
     assert usable and dict(rows)["dependencies"].startswith("unknown") and "python" in dict(rows)
-
-
-@pytest.mark.parametrize("arguments", [["surgeon"], ["--now"]])
-def test_wrong_call_ends_with_two(arguments):
-    assert doctor.main(arguments) == 2
 
 
 def test_the_constraints_name_every_dependency_and_reference():

@@ -8,25 +8,16 @@ from reli3d.nn.heads import COLOR_MARGIN
 from reli3d.nn.light_features import MIN_BRIGHTNESS, Shading, brightness_over_normal, harmonics, palette_of, unshaded
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
+from reli3d.render.transfer import spherical_harmonics
 
 
 def normals(n: int, seed: int = 0) -> torch.Tensor:
     return normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)), dim=-1)
 
 
-def spherical(n: torch.Tensor) -> torch.Tensor:
-    """Unnormalized spherical harmonics up to order two from the angles, float64: an independent way to their span."""
-    n = n.double()
-    theta, phi = torch.acos(n[:, 2].clamp(-1, 1)), torch.atan2(n[:, 1], n[:, 0])
-    s, c = theta.sin(), theta.cos()
-    first = [c, s * phi.cos(), s * phi.sin()]
-    second = [3 * c * c - 1, *(s * f for f in (c * phi.cos(), c * phi.sin(), s * (2 * phi).cos(), s * (2 * phi).sin()))]
-    return torch.stack([torch.ones_like(s), *first, *second], -1)
-
-
 def test_the_polynomials_span_the_spherical_harmonics():
     n = normals(200)
-    own, other = harmonics(n).double(), spherical(n)
+    own, other = harmonics(n).double(), spherical_harmonics(n.double())[:, :9]
     left = own - other @ torch.linalg.lstsq(other, own).solution
     assert float(left.abs().max()) < 1e-5  # float32 normals
     assert int(torch.linalg.matrix_rank(own)) == 9
@@ -50,9 +41,8 @@ def test_unobserved_points_have_no_weight():
     color = 0.5 + 0.3 * n[:, 1:2].expand(-1, 3)
     visible = (n[:, 1] > 0).float()
     spoilt = torch.where(visible[:, None] > 0, color, torch.full_like(color, 7.0))
-    torch.testing.assert_close(
-        brightness_over_normal(spoilt, visible, n), brightness_over_normal(color, visible, n), rtol=1e-3, atol=1e-3
-    )
+    got, expected = (brightness_over_normal(c, visible, n) for c in (spoilt, color))
+    torch.testing.assert_close(got, expected, rtol=1e-3, atol=1e-3)
 
 
 def test_nothing_seen_and_black_give_one():

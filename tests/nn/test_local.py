@@ -13,21 +13,13 @@ from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.symmetry import MirrorPlane
 from reli3d.nn.light_map import LightMap, splat
 from reli3d.nn.local import LocalReconstructor, PixelMaps, mean_logit
-from reli3d.nn.presets import SMALL, LightMapSizes, PyramidSizes, VolumeSizes
+from reli3d.nn.presets import SMALL, LightMapSizes, VolumeSizes
 from reli3d.nn.pyramid import pixel_hull_depths, pixel_positions
 from reli3d.nn.view_features import ViewMaps, ahead_of_surface
 from reli3d.nn.volume import FeatureVolume
-from reli3d.render.latlong import lat_long_directions, lat_long_texels
+from reli3d.render.latlong import lat_long_texels
+from tests.support.networks import LOCAL as TINY
 
-TINY = dataclasses.replace(
-    SMALL,
-    image_size=64,
-    pyramid=PyramidSizes((8, 8, 16), 8, 2),
-    volume=VolumeSizes(12, 0.56, (8, 16), 8),
-    light=LightMapSizes(16, (8, 16, 16)),
-    view_width=24,
-    head_width=16,
-)
 SIZE = TINY.image_size
 
 
@@ -41,7 +33,7 @@ def model():
     return model.eval()
 
 
-def sphere(count: int, seed: int = 0, turn: torch.Tensor | None = None):
+def sphere(count: int, seed: int = 0):
     """Views of a ball of radius 0.4 whose color is a function of the normal: images, masks, c2w, intrinsics."""
     generator = torch.Generator().manual_seed(seed)
     eye = normalize(torch.randn(count, 3, generator=generator), dim=-1) * 2.2
@@ -58,13 +50,6 @@ def sphere(count: int, seed: int = 0, turn: torch.Tensor | None = None):
     normal = normalize(point, dim=-1)
     images = torch.where(root[..., None] > 0, 0.5 + 0.3 * normal, torch.full_like(normal, 0.2))
     return images, (root > 0).float(), c2w, intrinsics
-
-
-def turned(c2w: torch.Tensor, yaw: float) -> torch.Tensor:
-    c, s = math.cos(yaw), math.sin(yaw)
-    moved = c2w.clone()
-    moved[:, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ c2w[:, :3]
-    return moved
 
 
 def encoded(model, images, masks, c2w, intrinsics, *, inference=False):
@@ -85,15 +70,6 @@ def evaluated(field):
     field = field.with_shading(position, normal, visible)
     material = field.material(position, normal, visible)
     return field.free_sdf(1.2 * position), material, field.radiance_map()
-
-
-@torch.no_grad()
-def test_sdf_within_equals_free_sdf_for_the_same_bound(model):
-    field = encoded(model, *sphere(2))
-    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(6)) - 0.5
-    bound = field.bound(points)
-    assert torch.equal(field.sdf_within(points, bound), field.free_sdf(points))
-    assert not torch.equal(field.sdf_within(points, bound + 1.0), field.free_sdf(points))
 
 
 @pytest.mark.parametrize("views", [1, 2, 5, 16])
@@ -144,52 +120,36 @@ def test_mirror_images_have_the_mirrored_maps(model):
     assert pixels.gain.std() > 0.01 and pixels.normal.std() > 0.1
 
 
-def test_every_view_is_read(model):
-    images, masks, c2w, intrinsics = sphere(3)
-    sdf, material, light = evaluated(encoded(model, images, masks, c2w, intrinsics))
-    changed = images.clone()
-    changed[2] = 1 - changed[2]
-    other, other_material, other_light = evaluated(encoded(model, changed, masks, c2w, intrinsics))
-    assert float((other - sdf).abs().max()) > 1e-3 and float((other_light - light).abs().max()) > 1e-3
-    assert float((other_material.base_color - material.base_color).abs().max()) > 1e-3
-
-
 def test_a_turn_of_the_world_turns_the_light(model):
     """By a multiple of the coarsest texel's width (four columns of 32)."""
     images, masks, c2w, intrinsics = sphere(3)
     field = encoded(model, images, masks, c2w, intrinsics)
-    yaw = 2 * math.pi * 4 / 32
+    c, s = math.cos(2 * math.pi * 4 / 32), math.sin(2 * math.pi * 4 / 32)
+    turned = torch.block_diag(torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]]), torch.ones(1, 1)) @ c2w
     with torch.no_grad():
-        other = encoded(model, images, masks, turned(c2w, yaw), intrinsics).log_light
+        other = encoded(model, images, masks, turned, intrinsics).log_light
         expected = torch.roll(field.log_light, -4, 2)  # from +X, the center, towards -Z, which is to the left
         wrong = torch.roll(field.log_light, 4, 2)
         assert float((wrong - expected).abs().mean()) > 0.01
         torch.testing.assert_close(other, expected, rtol=0, atol=1e-4)  # float32 through the U-Net
 
 
-def test_a_splat_at_texel_centers_returns_the_values():
-    flat = lat_long_directions(16).reshape(-1, 3)
-    values, weight = torch.randn(512, 2), torch.rand(512) + 0.5
-    mean, total = splat(values, weight, lat_long_texels(flat, 16), 16)
-    torch.testing.assert_close(mean.reshape(2, -1).T, values, rtol=0, atol=1e-4)  # angles are float32
-    torch.testing.assert_close(total.reshape(-1), torch.log1p(weight), rtol=0, atol=1e-5)  # the same
-
-
 def test_a_splat_is_the_adjoint_of_bilinear_lookup():
     """Of ``grid_sample`` with columns that wrap and rows that are clamped, summed weights against its gradient."""
     torch.manual_seed(1)
-    directions, weight = normalize(torch.randn(400, 3), dim=-1), torch.rand(400)
-    _, total = splat(torch.zeros(400, 1), weight, lat_long_texels(directions, 16), 16)
+    directions, weight, values = normalize(torch.randn(400, 3), dim=-1), torch.rand(400), torch.randn(400)
+    mean, total = splat(values[:, None], weight, lat_long_texels(directions, 16), 16)
     x, y, z = directions.double().unbind(-1)
     u, v = torch.atan2(z, x) / (2 * math.pi) + 0.5, y.acos() / math.pi
-    image = torch.zeros(1, 1, 16, 34, dtype=torch.float64, requires_grad=True)  # a column more at both sides
-    at = torch.stack([(u * 32 + 1) / 34 * 2 - 1, v * 2 - 1], -1)[None, None]
-    looked_up = torch.nn.functional.grid_sample(image, at, padding_mode="border", align_corners=False)
-    (grad,) = torch.autograd.grad((looked_up[0, 0, 0] * weight).sum(), image)
-    expected = grad[0, 0, :, 1:33]
-    expected[:, 0] += grad[0, 0, :, 33]
-    expected[:, -1] += grad[0, 0, :, 0]
-    torch.testing.assert_close(total[0].double().expm1(), expected, rtol=0, atol=1e-4)  # angles are float32
+    image = torch.zeros(2, 1, 16, 34, dtype=torch.float64, requires_grad=True)  # a column more at both sides
+    at = torch.stack([(u * 32 + 1) / 34 * 2 - 1, v * 2 - 1], -1)[None, None].expand(2, -1, -1, -1)
+    looked_up = torch.nn.functional.grid_sample(image, at, padding_mode="border", align_corners=False)[:, 0, 0]
+    (grad,) = torch.autograd.grad((looked_up * torch.stack([weight, weight * values])).sum(), image)
+    expected = grad[:, 0, :, 1:33]
+    expected[..., 0] += grad[:, 0, :, 33]
+    expected[..., -1] += grad[:, 0, :, 0]
+    torch.testing.assert_close(total[0].double().expm1(), expected[0], rtol=0, atol=1e-4)  # angles are float32
+    torch.testing.assert_close((mean[0] * total[0].expm1()).double(), expected[1], rtol=0, atol=1e-4)  # the same
 
 
 def test_a_mirror_shows_the_light_where_it_reflects_it():
@@ -234,9 +194,8 @@ def test_base_color_does_not_follow_the_exposure():
     torch.testing.assert_close(one, two, rtol=0, atol=1e-4)  # float32 logits
     maps = PixelMaps.of(0 * raw, span, camera, mean_logit(color, mask))
     gray = color.logit().mean(-1, keepdim=True)
-    torch.testing.assert_close(
-        maps.base_logit(color), color.logit() - gray + 0.8808 * (gray - mean_logit(color, mask)), rtol=0, atol=1e-3
-    )  # the gain has four digits here
+    expected = color.logit() - gray + 0.8808 * (gray - mean_logit(color, mask))
+    torch.testing.assert_close(maps.base_logit(color), expected, rtol=0, atol=1e-3)  # the gain has four digits here
 
 
 def test_pixels_know_their_place():
@@ -282,35 +241,11 @@ def test_the_view_that_sees_a_point_has_the_weight(model):
     torch.testing.assert_close(logit, gain * torch.tensor([[white], [black]]).expand(2, 3), rtol=0, atol=0.01)
 
 
-def outputs(field, inputs):
-    """All that a field gives, at points of its surface."""
-    position, normal = surface_of_ball(500)
-    visible = (torch.rand(500, len(inputs[0]), generator=torch.Generator().manual_seed(2)) > 0.5).float()
-    field = field.with_shading(position, normal, visible)
-    fused, material = field.fused(position, normal, visible), field.material(position, normal, visible)
-    heads = field.heads(position, normal, visible)
-    unlit = [field.free_sdf(position), field.sdf(1.2 * position), heads, field.radiance_map(), field.volume]
-    return [*vars(fused).values(), *vars(material).values(), *unlit]
-
-
-@pytest.mark.parametrize("views", [1, 5])
-def test_a_forward_pass_gives_the_same_numbers_with_and_without_gradient(model, views):
-    inputs = sphere(views)
-    recorded = outputs(encoded(model, *inputs), inputs)
-    with torch.no_grad():
-        unlit = outputs(encoded(model, *inputs), inputs)
-    assert any(value.requires_grad for value in recorded)
-    for a, b in zip(unlit, recorded, strict=True):
-        assert torch.equal(a, b)
-
-
-def test_the_fused_pass_is_the_one_that_trains(model):
-    """The kernel of inference against torch's operations, which have the gradient."""
-    position, normal = surface_of_ball(3000)
-    inputs = sphere(5)
-    visible = (torch.rand(3000, 5, generator=torch.Generator().manual_seed(2)) > 0.5).float()
-    expected = encoded(model, *inputs).fused(position, normal, visible)
-    got = encoded(model, *inputs, inference=True).fused(position, normal, visible)
+def test_inference_by_fused_kernels_in_blocks_of_points_gives_what_training_gives(model):
+    position, normal = surface_of_ball(9000)  # blocks have 8192
+    visible = (torch.rand(9000, 5, generator=torch.Generator().manual_seed(2)) > 0.5).float()
+    field, trained = (encoded(model, *sphere(5), inference=fast) for fast in (True, False))
+    got, expected = field.fused(position, normal, visible), trained.fused(position, normal, visible)
     assert expected.logit.requires_grad and not got.logit.requires_grad
     # sums of five float32 terms in another order; logits of up to 4, and exp of the confidence
     torch.testing.assert_close(got.logit, expected.logit.detach(), rtol=0, atol=2e-5)
@@ -318,6 +253,15 @@ def test_the_fused_pass_is_the_one_that_trains(model):
     torch.testing.assert_close(got.numbers[:, :9], expected.numbers[:, :9].detach(), rtol=0, atol=5e-5)
     # the root of a difference of squares: 1e-3 where the views agree
     torch.testing.assert_close(got.numbers[:, 9], expected.numbers[:, 9].detach(), rtol=1e-3, atol=1e-3)
+    field, trained = (f.with_shading(position, normal, visible) for f in (field, trained))
+    blocks, whole = (f.material(position, normal, visible) for f in (field, trained))
+    heads = field.heads(position, normal, visible)
+    later = field.material_from_heads(heads, position, normal, visible)
+    assert all(torch.equal(a, b) for a, b in zip(vars(later).values(), vars(blocks).values(), strict=True))
+    # the fused pass sums in another order, behind a dozen layers
+    torch.testing.assert_close(blocks.base_color, whole.base_color.detach(), rtol=0, atol=1e-4)
+    torch.testing.assert_close(blocks.normal, whole.normal.detach(), rtol=0, atol=1e-3)
+    torch.testing.assert_close(field.sdf(position), trained.sdf(position).detach(), rtol=0, atol=2e-3)
 
 
 def test_the_volume_is_read_where_it_was_written():
@@ -326,19 +270,6 @@ def test_the_volume_is_read_where_it_was_written():
     grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)  # the coordinates themselves as features
     points = torch.rand(500, 3) * 1.1 - 0.55
     torch.testing.assert_close(volume.sample(grid, points), points, rtol=0, atol=1e-6)
-
-
-def test_inference_in_blocks_of_points_gives_what_training_gives(model):
-    position, normal = surface_of_ball(9000)  # blocks have 8192
-    visible, inputs = torch.ones(9000, 2), sphere(2)
-    field, trained = encoded(model, *inputs, inference=True), encoded(model, *inputs)
-    trained = trained.with_shading(position, normal, visible)
-    blocks = field.with_shading(position, normal, visible).material(position, normal, visible)
-    whole = trained.material(position, normal, visible)
-    # the fused pass sums in another order, behind a dozen layers
-    torch.testing.assert_close(blocks.base_color, whole.base_color.detach(), rtol=0, atol=1e-4)
-    torch.testing.assert_close(blocks.normal, whole.normal.detach(), rtol=0, atol=1e-3)
-    torch.testing.assert_close(field.sdf(position), trained.sdf(position).detach(), rtol=0, atol=2e-3)
 
 
 def test_points_know_whether_they_lie_before_a_surface():
@@ -366,17 +297,6 @@ def test_points_know_whether_they_lie_before_a_surface():
         torch.testing.assert_close(got[:, column], expected, rtol=0, atol=1e-4)
     got[0, 0].backward()
     assert float(widening.grad) < 0
-
-
-@torch.no_grad()
-def test_heads_known_before_give_the_same_material(model):
-    position, normal = surface_of_ball(300)
-    visible = (torch.rand(300, 3, generator=torch.Generator().manual_seed(2)) > 0.3).float()
-    field = encoded(model, *sphere(3)).with_shading(position, normal, visible)
-    at_once = field.material(position, normal, visible)
-    later = field.material_from_heads(field.heads(position, normal, visible), position, normal, visible)
-    for a, b in zip(vars(at_once).values(), vars(later).values(), strict=True):
-        assert torch.equal(a, b)
 
 
 @torch.no_grad()

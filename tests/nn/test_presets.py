@@ -13,17 +13,10 @@ from reli3d.geometry.camera import look_at
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import OFFICIAL, SMALL, LocalPreset, from_json, to_json
 from reli3d.nn.weights import WeightsError, load, network, shapes, write
+from tests.support import networks
 from tests.support.networks import NANO, views
 
-LOCAL = dataclasses.replace(
-    SMALL,
-    image_size=32,
-    pyramid=dataclasses.replace(SMALL.pyramid, widths=(8, 8, 16), features=8, reading=2),
-    volume=dataclasses.replace(SMALL.volume, side=6, widths=(8, 16), features=8),
-    light=dataclasses.replace(SMALL.light, height=8, widths=(8, 16)),
-    view_width=16,
-    head_width=8,
-)
+LOCAL = dataclasses.replace(networks.LOCAL, image_size=32)
 HUGE = 1 << 40
 HOSTILE = [0, 1, 2, 3, 7, -1, HUGE, 8192, 0.5, math.nan, math.inf, True, None, "8", [], [8], [0, 8, 8], [7, 17, 9], {}]
 HOSTILE += [[8.0, 8, 8], [HUGE] * 3, [8] * 9, [8192, 8192, 8192], [1, 1, 1], [8, 8], [16, 24, 32]]

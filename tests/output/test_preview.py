@@ -68,10 +68,8 @@ def test_the_filter_takes_noise_and_leaves_edges(asset):
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
     tile = preview.unseen_cameras(asset.mesh, rig((0, 15, 3), target=(2.0, 2.0, 2.0)))[0]
     camera = Camera(tile.c2w, tile.intrinsics, tile.width // 2, tile.height // 2)
-    few, many = (
-        render_asset(checkered, camera, options=ShadeOptions(samples=samples), supersampling=2, scene=scene)
-        for samples in (preview.SUBPIXEL_SAMPLES, (400, 80, 20))
-    )
+    options = (ShadeOptions(samples=samples) for samples in (preview.SUBPIXEL_SAMPLES, (400, 80, 20)))
+    few, many = (render_asset(checkered, camera, options=o, supersampling=2, scene=scene) for o in options)
     (smooth,) = preview._denoised(few)
     before, after = ((x - many.radiance).square().mean() for x in (few.radiance, smooth))
     assert float(after) < 0.15 * float(before)  # 0.06; a box of the same size, unguided, has 0.34

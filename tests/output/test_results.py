@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from reli3d.errors import InputError
-from reli3d.output.folder import check_place, claimed, exchanged
+from reli3d.output.folder import check_place, claimed
 
 OURS = ("a", "b", "c")
 
@@ -90,17 +90,6 @@ def test_a_kill_at_any_operation_leaves_one_whole_result_and_every_foreign_file(
         if done.returncode == 0:
             break
     assert last > 10 and outcomes == ({"old", "new"} if before else {"none", "new"})
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="Linux alone exchanges two folders in one step")
-def test_two_folders_are_exchanged_and_a_missing_one_is_an_error(tmp_path):
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "word").write_text(name)
-    assert exchanged(tmp_path / "a", tmp_path / "b")
-    assert [(tmp_path / name / "word").read_text() for name in ("a", "b")] == ["b", "a"]
-    with pytest.raises(FileNotFoundError):
-        exchanged(tmp_path / "a", tmp_path / "c")
 
 
 @pytest.mark.parametrize("name", ["n" * 250, "ö" * 127, b"caf\xe9 \xff".decode(errors="surrogateescape")])

@@ -109,23 +109,15 @@ def choose(**values) -> str:
     return code
 
 
-def one_page(asset: Asset, views: Views, light: Environment | None = None) -> str:
-    meshes = {"mesh": Shown(glb_bytes(asset), shadow(asset.mesh))}
+def one_page(asset: Asset, views: Views, light: Environment | None = None, meshes=("mesh",)) -> str:
+    shown = Shown(glb_bytes(asset), shadow(asset.mesh))
     radiance = (light or asset.light).radiance
-    return viewer_page("x", meshes, radiance, torch.zeros(3), 0.7, photograph_stops(views))
+    stops = photograph_stops(views)
+    return viewer_page("a <ball>", dict.fromkeys(meshes, shown), radiance, torch.zeros(3), 0.7, stops)
 
 
 def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, tab, asset, views):
-    mesh = Shown(glb_bytes(asset), shadow(asset.mesh))
-    page = viewer_page(
-        "a <ball>",
-        {"before": mesh, "after": mesh},
-        asset.environment.radiance,
-        torch.zeros(3),
-        0.7,
-        photograph_stops(views),
-    )
-    (tmp_path / "viewer.html").write_text(page)
+    (tmp_path / "viewer.html").write_text(one_page(asset, views, meshes=("before", "after")))
     tab.open((tmp_path / "viewer.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
 
     def rendered(**values) -> np.ndarray:
@@ -166,8 +158,7 @@ def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, tab, asset, vie
 
 def test_the_page_shows_self_occlusion(tmp_path, tab, waisted, views):
     """In each light, turned and brightened: nearer to our renderer than without, and near."""
-    page = one_page(waisted, views, studio())
-    (tmp_path / "viewer.html").write_text(page)
+    (tmp_path / "viewer.html").write_text(one_page(waisted, views, studio()))
     found = {}
     tab.open((tmp_path / "viewer.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
     for i, (name, turn, stops, light) in enumerate((("estimated light", 30, 0, studio()), ("sky", -60, -1, sky()))):
@@ -201,8 +192,7 @@ def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, tab, asset, views, mo
         monkeypatch.setattr(
             viewer, "blocked_transfer", lambda m, scene, h=hidden: h * cosine * spherical_harmonics(m.normals)
         )
-        page = one_page(asset, views, sky())
-        (tmp_path / f"{stops}.html").write_text(page)
+        (tmp_path / f"{stops}.html").write_text(one_page(asset, views, sky()))
         tab.open((tmp_path / f"{stops}.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
         images.append(pixels(tab.evaluate("take(0); " + choose(turn=40, stopsof=stops) + "imageURL()")).astype(int))
     assert tab.problems == []

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 import trimesh
 
@@ -20,14 +19,6 @@ from tests.support.meshes import mesh_from
 EYES = [(0.3, 0.9, 2.4), (2.3, 0.4, -0.8), (-2.2, 0.9, 0.4), (0.2, -0.3, -2.2)]
 
 
-@pytest.fixture(scope="module")
-def bumpy():
-    ball = mesh_from(trimesh.creation.icosphere(subdivisions=5))
-    radius = 0.38 + 0.012 * torch.sin(16 * ball.vertices).prod(-1, keepdim=True)
-    vertices = (ball.vertices * radius).contiguous()
-    return Mesh(vertices, ball.faces, vertex_normals(vertices, ball.faces))
-
-
 def normal_maps(mesh, camera):
     """World normals ``(V, H, W, 3)`` of ``mesh`` and coverage ``(V, H, W)``."""
     hits = RayScene(mesh.vertices, mesh.faces).closest(*(t.reshape(-1, 3) for t in camera_rays(camera)))
@@ -36,7 +27,11 @@ def normal_maps(mesh, camera):
     return normals.reshape(*size, 3), (hits.face >= 0).reshape(size)
 
 
-def test_the_surface_follows_the_normals_of_the_views(bumpy):
+def test_the_surface_follows_the_normals_of_the_views():
+    ball = mesh_from(trimesh.creation.icosphere(subdivisions=5))
+    radius = 0.38 + 0.012 * torch.sin(16 * ball.vertices).prod(-1, keepdim=True)
+    vertices = (ball.vertices * radius).contiguous()
+    bumpy = Mesh(vertices, ball.faces, vertex_normals(vertices, ball.faces))
     camera = Camera.from_fov(torch.stack([look_at(eye) for eye in EYES]), 0.5, 256, 256)
     normals, covered = normal_maps(bumpy, camera)
     shade = 0.3 + 0.5 * (normals @ torch.tensor([0.3, 0.9, 0.3])).clamp(min=0)[..., None].expand(-1, -1, -1, 3)

@@ -183,6 +183,5 @@ def test_the_command_takes_published_weights_and_reports_how_it_used_them(tiny, 
     capsys.readouterr()
     assert infer.main([*arguments, "--skip-existing"]) == 0
     assert "skipped" in capsys.readouterr().err
-    for hero, word in (("2", "expected 0 to 1 with 2 views"), ("-1", "expected 0 to 1"), ("first", "invalid int")):
-        assert infer.main([*arguments, f"--hero={hero}"]) == 2
-        assert word in capsys.readouterr().err
+    assert infer.main([*arguments, "--hero=2"]) == 2
+    assert "expected 0 to 1 with 2 views" in capsys.readouterr().err

@@ -49,16 +49,11 @@ def scene_surface(seed: int, table_yaw: float = 0.0, table: float = TABLE) -> tu
     mosaic = [spots(turn * f, 7 + k, fraction=0.5) for k, f in enumerate((9.0, 23.0, 51.0))]
     dark, light, warm = Coat((0.05, 0.06, 0.08), 0.9), Coat((0.7, 0.68, 0.6), 0.9), Coat((0.5, 0.2, 0.1), 0.9)
     stone = Material(Coat((0.3, 0.3, 0.32), 0.9), ((dark, mosaic[0]), (light, mosaic[1]), (warm, mosaic[2])))
-    skin = [
-        Material(
-            Coat(c, 0.7),
-            (
-                (Coat(d, 0.7), spots(np.eye(3) * 14.0, 31 + k, fraction=0.5)),
-                (Coat(e, 0.7), spots(np.eye(3) * 37.0, 61 + k, fraction=0.4)),
-            ),
-        )
-        for k, (c, d, e) in enumerate((((0.6, 0.1, 0.1), (0.8, 0.7, 0.2), (0.1, 0.1, 0.3)),) * len(shape.materials))
-    ]
+    red, yellow, blue = (Coat(c, 0.7) for c in ((0.6, 0.1, 0.1), (0.8, 0.7, 0.2), (0.1, 0.1, 0.3)))
+    skin = []
+    for k in range(len(shape.materials)):
+        coarse, fine = spots(np.eye(3) * 14.0, 31 + k, fraction=0.5), spots(np.eye(3) * 37.0, 61 + k, fraction=0.4)
+        skin.append(Material(red, ((yellow, coarse), (blue, fine))))
     low = float(shape.vertices[:, 1].min())
     corners = np.array([[-1, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]], np.float32) * table + (0, low, 0)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32) + len(shape.vertices)
@@ -89,14 +84,7 @@ def board(azimuth: float, origins, directions, depth) -> tuple[torch.Tensor, tor
 
 
 def render_capture(
-    seed: int = 3,
-    views: int = 20,
-    size: tuple[int, int] = (400, 300),
-    *,
-    heights: tuple[float, float] = (24, 46),
-    moved_after: int | None = None,
-    turntable: bool = False,
-    passerby: bool = False,
+    seed=3, views=20, size=(400, 300), *, heights=(24, 46), moved_after=None, turntable=False, passerby=False
 ) -> TrueCapture:
     """A ring of hand-held views at two heights [degrees] under a sky; cameras are relative to the object.
 
@@ -134,9 +122,8 @@ def render_capture(
         seen = (hits.face >= 0).nonzero()[:, 0]
         points = surface.points_at(hits.face[seen].long(), hits.bary[seen])
         image = environment.lookup(directions) * 0.5
-        image[seen] = shade(
-            points, -directions[seen], environment, scene=surface.scene, options=ShadeOptions(samples=samples, seed=k)
-        )
+        options = ShadeOptions(samples=samples, seed=k)
+        image[seen] = shade(points, -directions[seen], environment, scene=surface.scene, options=options)
         if passerby:
             front, color = board(float(azimuth[k] + np.pi + 0.4 * np.sin(1.9 * k)), origins, directions, hits.t)
             image[front] = color

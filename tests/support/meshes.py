@@ -7,31 +7,15 @@ import trimesh
 from reli3d.geometry.mesh import Mesh
 
 QUICK = ["avocado", "suzanne", "scifi_crate", "plastic_monobloc_chair_01", "abalone_shell"]
-SLOW = [
-    "boombox",
-    "coffee_grinder",
-    "dutch_ship_medium",
-    "exploding_barrel",
-    "french_horn",
-    "horse_statue_01",
-    "numeric_keypad",
-    "painted_wooden_cabinet_02",
-    "painted_wooden_stool",
-    "rune_sword",
-    "shader_ball",
-    "sheen_chair",
-    "sofa_03",
-    "wicker_sphere",
-    "wooden_table_02",
-]
+SLOW = ["boombox", "coffee_grinder", "dutch_ship_medium", "exploding_barrel", "french_horn", "horse_statue_01"]
+SLOW += ["numeric_keypad", "painted_wooden_cabinet_02", "painted_wooden_stool", "rune_sword", "shader_ball"]
+SLOW += ["sheen_chair", "sofa_03", "wicker_sphere", "wooden_table_02"]
 
 
 def mesh_of(vertices, faces, device="cpu") -> Mesh:
     """On ``device``, whatever torch's default is."""
-    return Mesh(
-        torch.as_tensor(np.asarray(vertices), dtype=torch.float32, device=device).contiguous(),
-        torch.as_tensor(np.asarray(faces), dtype=torch.int32, device=device).contiguous(),
-    )
+    parts = (vertices, torch.float32), (faces, torch.int32)
+    return Mesh(*(torch.as_tensor(np.asarray(v), dtype=dtype, device=device).contiguous() for v, dtype in parts))
 
 
 def mesh_from(shape: trimesh.Trimesh, device="cpu") -> Mesh:
@@ -69,8 +53,7 @@ def sheet(n=9):
     x, y = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     vertices = np.stack([x, y, np.random.default_rng(0).normal(size=x.shape)], -1).reshape(-1, 3)
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
-    faces = np.concatenate(
-        [np.stack([corner, corner + n, corner + n + 1], -1), np.stack([corner, corner + n + 1, corner + 1], -1)]
-    )
+    first, second = (corner, corner + n, corner + n + 1), (corner, corner + n + 1, corner + 1)
+    faces = np.concatenate([np.stack(first, -1), np.stack(second, -1)])
     border = ((x == 0) | (y == 0) | (x == n - 1) | (y == n - 1)).reshape(-1)
     return Mesh(torch.tensor(vertices, dtype=torch.float32), torch.tensor(faces, dtype=torch.int32)), border

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from reli3d.nn import presets
 from reli3d.nn.model import Reconstructor
-from reli3d.nn.presets import OFFICIAL, BackboneSizes, EncoderSizes, IlluminationSizes, UpsamplerSizes
+from reli3d.nn.presets import OFFICIAL, SMALL, BackboneSizes, EncoderSizes, IlluminationSizes, UpsamplerSizes
 from reli3d.nn.reni import EnvironmentDecoder
 from reli3d.nn.weights import published_state, read_manifest, read_tensors
 
@@ -47,6 +48,17 @@ NANO = replace(  # the paper's network at sizes that run in milliseconds, withou
     roughness_is_alpha=False,
     published_input=False,
     reads_background=False,
+)
+
+
+LOCAL = replace(  # the network of convolutions
+    SMALL,
+    image_size=64,
+    pyramid=presets.PyramidSizes((8, 8, 16), 8, 2),
+    volume=presets.VolumeSizes(12, 0.56, (8, 16), 8),
+    light=presets.LightMapSizes(16, (8, 16, 16)),
+    view_width=24,
+    head_width=16,
 )
 
 

@@ -72,11 +72,8 @@ def units(n: int, seed: int = 0) -> Tensor:
 
 def above(n: int, seed: int = 0) -> Tensor:
     """Unit directions at least 0.1 above the horizon of +z."""
-    return normalize(
-        units(n, seed) * torch.tensor([1.0, 1.0, 0.0], **HOST)
-        + uniform(n, 1, seed=seed + 50, low=0.15, high=2.0) * torch.tensor([0.0, 0.0, 1.0], **HOST),
-        dim=-1,
-    )
+    height = uniform(n, 1, seed=seed + 50, low=0.15, high=2.0)
+    return normalize(torch.cat([units(n, seed)[:, :2], height], 1), dim=-1)
 
 
 def numbers(n: int) -> Tensor:
@@ -136,14 +133,9 @@ def rig(device, width: int = 20, height: int = 24) -> Camera:
 
 
 def shaded(n: int) -> dict[str, Tensor]:
-    normal = units(n, 1)
-    return {
-        "normal": normal,
-        "base_color": uniform(n, 3, seed=2, low=0.1),
-        "metallic": uniform(n, seed=4),
-        "roughness": uniform(n, seed=3, low=0.2),
-        "radiance": uniform(8, 16, 3, seed=5) ** 3 * 2.0,
-    }
+    finish = {"metallic": uniform(n, seed=4), "roughness": uniform(n, seed=3, low=0.2)}
+    radiance = uniform(8, 16, 3, seed=5) ** 3 * 2.0
+    return {"normal": units(n, 1), "base_color": uniform(n, 3, seed=2, low=0.1), **finish, "radiance": radiance}
 
 
 def lit(shadows: str | None = None, **options):
@@ -185,23 +177,17 @@ def grid_inputs(_, shape=(7, 6, 8), seed: int = 3) -> dict[str, Tensor]:
     sdf = torch.nn.functional.pad(torch.randn(shape, generator=rng(seed), **HOST), (1,) * 6, value=0.7)
     sdf = sdf + 0.2 * sdf.sign()  # no crossing next to a grid point, where gradients are unbounded
     cubes = (sdf.shape[0] - 1) * (sdf.shape[1] - 1) * (sdf.shape[2] - 1)
-    return {
-        "sdf": sdf,
-        "deformation": uniform(*sdf.shape, 3, seed=4, low=-0.02, high=0.02),
-        "alpha": uniform(cubes, 8, seed=5, low=0.5),
-        "beta": uniform(cubes, 12, seed=6, low=0.5),
-        "gamma": uniform(cubes, seed=7, low=0.5),
-    }
+    deformation = uniform(*sdf.shape, 3, seed=4, low=-0.02, high=0.02)
+    alpha, beta, gamma = (
+        uniform(*size, seed=k, low=0.5) for size, k in (((cubes, 8), 5), ((cubes, 12), 6), ((cubes,), 7))
+    )
+    return {"sdf": sdf, "deformation": deformation, "alpha": alpha, "beta": beta, "gamma": gamma}
 
 
 def surface(sdf, deformation, alpha, beta, gamma):
     weights = CubeWeights(deformation, alpha, beta, gamma)
     mesh = extract_surface(sdf, radius=0.8, weights=weights, center=True)
     return mesh.vertices, mesh.faces
-
-
-def deviation(sdf, deformation, alpha, beta):
-    return (vertex_deviation(sdf, radius=0.8, weights=CubeWeights(deformation, alpha, beta)),)
 
 
 def points_of(vertices, normals, uv, base_color, roughness, metallic, normal, bary):
@@ -231,26 +217,9 @@ def bsdf(diffuse_model):
 
 
 def bsdf_inputs(n):
-    return {
-        "wo": above(n, 1),
-        "wi": above(n, 2),
-        "base_color": uniform(n, 3, seed=3),
-        "alpha": uniform(n, seed=4, low=0.1),
-        "metallic": uniform(n, seed=5),
-    }
-
-
-def moved(vertices):
-    _, faces = ball(vertices.device)
-    return (taubin_smooth(Mesh(vertices, faces), iterations=3).vertices,)
-
-
-def bumped(bump):
-    return (radial_bump(*(units(len(bump), k).to(bump) for k in (2, 3)), bump),)
-
-
-def posed(c2w, intrinsics):
-    return camera_rays(Camera(c2w, intrinsics, 12, 9))
+    directions = {"wo": above(n, 1), "wi": above(n, 2)}
+    finish = {"alpha": uniform(n, seed=4, low=0.1), "metallic": uniform(n, seed=5)}
+    return {**directions, "base_color": uniform(n, 3, seed=3), **finish}
 
 
 def traced(backend):
@@ -319,10 +288,6 @@ def hulls(masks, points):
 def hull_masks():
     y, x = torch.meshgrid(torch.arange(24.0, **HOST), torch.arange(20.0, **HOST), indexing="ij")
     return ((y - 12.5).square() + (x - 10.5).square() < 60.0).float().expand(3, 24, 20).contiguous()
-
-
-def covered(sdf, bound, masks):
-    return (cover_silhouettes(sdf, bound, hull.mask_distance(masks), rig(sdf.device), radius=0.7),)
 
 
 def drawn(u, radiance, wo, alpha):
@@ -394,14 +359,18 @@ CASES = {
     "extract_surface": Case(grid_inputs, surface, (*GRID, "gamma"), second=("gamma",)),
     "vertex_deviation": Case(
         # few crossings, none within 3e-4 of a kink of the mean absolute deviation
-        lambda n: {k: v for k, v in grid_inputs(n, (3, 3, 4), 24).items() if k in GRID}, deviation, GRID, second=GRID),
+        lambda n: {k: v for k, v in grid_inputs(n, (3, 3, 4), 24).items() if k in GRID},
+        lambda sdf, **weights: (vertex_deviation(sdf, radius=0.8, weights=CubeWeights(**weights)),), GRID, second=GRID),
     "sign_entropy": Case(
         lambda n: {"sdf": torch.randn(6, 7, 8, generator=rng(1), **HOST)}, lambda sdf: (sign_entropy(sdf),),
         ("sdf",), second=("sdf",)),
     "vertex_normals": Case(
         lambda n: {"vertices": ball("cpu")[0]}, lambda vertices: (vertex_normals(vertices, ball(vertices.device)[1]),),
         ("vertices",), second=("vertices",)),
-    "taubin_smooth": Case(lambda n: {"vertices": ball("cpu")[0]}, moved, ("vertices",)),
+    "taubin_smooth": Case(
+        lambda n: {"vertices": ball("cpu")[0]},
+        lambda vertices: (taubin_smooth(Mesh(vertices, ball(vertices.device)[1]), iterations=3).vertices,),
+        ("vertices",)),
     "gather_views": Case(
         lambda n: {"maps": uniform(3, 24, 20, 5, seed=1), "points": uniform(n, 3, low=-0.8, high=0.8)},
         lambda maps, points: projection.gather_views(maps, points, rig(points.device)), ("maps", "points"),
@@ -418,10 +387,13 @@ CASES = {
         ("points",),
         second=("points",)),
     "camera_rays": Case(
-        lambda n: {"c2w": rig("cpu").c2w, "intrinsics": rig("cpu").intrinsics}, posed, ("c2w", "intrinsics"),
+        lambda n: {"c2w": rig("cpu").c2w, "intrinsics": rig("cpu").intrinsics},
+        lambda c2w, intrinsics: camera_rays(Camera(c2w, intrinsics, 12, 9)), ("c2w", "intrinsics"),
         second=("c2w", "intrinsics")),
     "radial_bump": Case(
-        lambda n: {"bump": above(n, 1)}, bumped, ("bump",), ("bump",), second=("bump",), dtypes=("bump",)),
+        lambda n: {"bump": above(n, 1)},
+        lambda bump: (radial_bump(*(units(len(bump), k).to(bump) for k in (2, 3)), bump),), ("bump",), ("bump",),
+        second=("bump",), dtypes=("bump",)),
     "encode_normals": Case(
         lambda n: {"world": units(n, 1)},
         lambda world: (encode_normals(world, *(v[: len(world)].to(world.device) for v in FRAME.values())),), ("world",),
@@ -450,5 +422,6 @@ CASES |= {  # without gradient
     "cover_silhouettes": Case(
         lambda n: {"sdf": uniform(12, 11, 10, seed=1, low=0.1, high=2.0), "bound": uniform(12, 11, 10, low=-3.0),
                    "masks": hull_masks()},
-        covered),
+        lambda sdf, bound, masks: (
+            cover_silhouettes(sdf, bound, hull.mask_distance(masks), rig(sdf.device), radius=0.7),)),
 }  # fmt: skip

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import torch
 
+from reli3d.geometry.bake import bake
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.uv import unwrap
@@ -40,7 +41,6 @@ def sky() -> Environment:
 
 def two_colored(asset: Asset) -> Asset:
     """The ball with a red and a green half and the sky around it."""
-    from reli3d.geometry.bake import bake
 
     def base_color(position, normal):
         side = torch.sigmoid(40.0 * position[:, :1])

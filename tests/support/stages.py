@@ -66,8 +66,7 @@ def write_samples(folder: Path, seeds=SEEDS, views: int = 4, size: int = 48) -> 
     """Samples of a seed each, under a sky that is bright towards +X."""
     light = 0.2 + 3.0 * lat_long_directions(32)[..., :1].clamp(min=0).expand(-1, -1, 3).contiguous()
     for seed in seeds:
-        sample = synthesize(
-            ObjectSurface(make_object(seed)), light, np.random.default_rng(seed), size=size, views=views
-        )
+        rng = np.random.default_rng(seed)
+        sample = synthesize(ObjectSurface(make_object(seed)), light, rng, size=size, views=views)
         save_file(sample, folder / f"{seed:010d}.safetensors")
     return folder

@@ -60,12 +60,5 @@ def points(n, seed=1):
 def inputs(n, device):
     """Leaves in the order of ``shade``: normal, wo, base, roughness, metallic."""
     g = torch.Generator().manual_seed(4)
-    normal, wo = points(n, seed=6)
-    values = [
-        normal,
-        wo,
-        0.2 + 0.6 * torch.rand(n, 3, generator=g),
-        0.4 + 0.4 * torch.rand(n, generator=g),
-        torch.rand(n, generator=g),
-    ]
-    return [v.to(device) for v in values]
+    base, rough = 0.2 + 0.6 * torch.rand(n, 3, generator=g), 0.4 + 0.4 * torch.rand(n, generator=g)
+    return [v.to(device) for v in (*points(n, seed=6), base, rough, torch.rand(n, generator=g))]

@@ -109,11 +109,6 @@ def test_a_sample_is_a_function_of_seed_and_light_and_its_light_a_turned_map():
     assert not torch.equal(made[0]["c2w"], made[1]["c2w"])
 
 
-def test_the_numbers_of_views_are_the_papers():
-    assert [protocol.views_of(k, True) for k in range(3)] == [34, 33, 33]
-    assert [protocol.views_of(k, False) for k in range(3)] == [10, 10, 10]
-
-
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
     """A folder of one GLB with two numbers for its material, and one procedural object, by the command."""

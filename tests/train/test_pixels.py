@@ -15,21 +15,12 @@ from reli3d.geometry.hull import hull_distance
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.presets import SMALL
 from reli3d.nn.pyramid import ImagePyramid
+from reli3d.train import pixels
 from reli3d.train.batches import TrainingViews, load_sample
 from reli3d.train.checkpoint import load_average
 from reli3d.train.loop import train
 from reli3d.train.losses import PIXEL_TERMS, losses, pixel_losses
-from reli3d.train.pixels import (
-    Group,
-    ViewCache,
-    augmented,
-    draw_group,
-    is_pixel_parameter,
-    missing_parameters,
-    predict_pixels,
-    read_views_reduced,
-    reduced_model,
-)
+from reli3d.train.pixels import Group, draw_group, predict_pixels, read_views_reduced
 from reli3d.train.small import PixelStage
 from tests.support.stages import rendered_sample
 
@@ -45,7 +36,7 @@ def learned(finest: int = 0) -> LocalReconstructor:
     model = LocalReconstructor(SMALL)
     for head in model.pyramid.says.values():
         torch.nn.init.normal_(head[1].weight, std=0.3)
-    return reduced_model(model, finest) if finest else model
+    return pixels.reduced_model(model, finest) if finest else model
 
 
 def test_images_of_the_full_size_are_those_of_a_sample(files):
@@ -76,7 +67,7 @@ def test_mirrored_images_are_those_of_the_mirrored_object(files):
     views = read_views_reduced(files[0], 2)
     sample = load_sample(files[0], 1, 2048, np.random.default_rng(0), augment=False)
     for seed in range(20):
-        got = augmented(views, np.random.default_rng(seed))
+        got = pixels.augmented(views, np.random.default_rng(seed))
         side = "left" if float((got.c2w[:, :3, 3].sum(0) - views.c2w[:, :3, 3].sum(0)).abs()[0]) > 1e-3 else "right"
         points = sample.surface[:, 0] * torch.tensor([-1.0 if side == "left" else 1.0, 1.0, 1.0])
         camera = Camera(got.c2w, got.intrinsics, *got.masks.shape[:0:-1])
@@ -144,7 +135,7 @@ def test_an_object_without_a_whole_pixel_has_no_terms(files):
 
 
 def test_every_view_of_a_drawn_object_is_read_once(files):
-    cache = ViewCache(2)
+    cache = pixels.ViewCache(2)
     group = draw_group(files, [(1, k) for k in range(3)], cache, max_views=4)
     assert sum(group.counts) == len(group.views.masks) == 18 and max(group.counts) <= 4
     again = draw_group(files, [(1, k) for k in range(3)], cache, max_views=4)
@@ -177,7 +168,7 @@ def test_levels_are_trained_one_after_the_other(folder, tmp_path, capsys):
         assert all(float((more[k] - v).abs().max()) < 1e-6 for k, v in fewer.items())
     del small["pyramid.shared.weight"]
     with pytest.raises(ValueError, match="pyramid.shared.weight"):
-        load_average(tmp_path, LocalReconstructor(SMALL), {"average": small}, missing_parameters(SMALL, small))
+        load_average(tmp_path, LocalReconstructor(SMALL), {"average": small}, pixels.missing_parameters(SMALL, small))
 
 
 def test_training_of_pixels_teaches_the_2d_u_net_alone(folder, tmp_path):
@@ -185,9 +176,11 @@ def test_training_of_pixels_teaches_the_2d_u_net_alone(folder, tmp_path):
         model = learned(finest)
         before = {k: v.clone() for k, v in model.state_dict().items()}
         stage = PixelStage(model, [folder])
-        train(stage, stage.options(str(tmp_path / str(side)), steps=3, batch=1, warmup=1))
+        out = tmp_path / str(side)
+        train(stage, stage.options(str(out), steps=3, batch=1, warmup=1, save_every=1))  # more often than log_every
+        assert len((out / "log.jsonl").read_text().splitlines()) == 4  # options and steps
         changed = {k for k, v in model.state_dict().items() if not torch.equal(v, before[k])}
-        assert changed == {k for k in before if is_pixel_parameter(k)} and len(changed) > 20
+        assert changed == {k for k in before if pixels.is_pixel_parameter(k)} and len(changed) > 20
 
 
 def test_samples_of_views_alone_teach_the_2d_u_net_and_nothing_else(tmp_path, capsys):

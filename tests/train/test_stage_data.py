@@ -1,7 +1,6 @@
 """Sources of objects: real captures, shards and latents of lights."""
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +16,10 @@ from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
 from reli3d.render.latlong import lat_long_directions
 from reli3d.train.stages.captures import Captures
-from reli3d.train.stages.config import StageConfig
 from reli3d.train.stages.latents import fitted
-from reli3d.train.stages.losses import gradients
 from reli3d.train.stages.shards import Shards, pack, source
-from reli3d.train.stages.step import object_losses
-from reli3d.train.stages.views import Samples, draw
-from tests.support.stages import ball_model, write_samples
-
-GAUSSIANS = StageConfig("gaussians", "gaussians", 16, lobes=16)
-REAL = Path(os.environ.get("RELI3D_CAPTURES", "../shared/data/captures"))
+from reli3d.train.stages.views import Samples
+from tests.support.stages import write_samples
 
 
 @pytest.fixture(scope="module")
@@ -98,23 +91,6 @@ def test_pixels_outside_a_photograph_are_not_valid(captures):
         assert bool((inside < -1).any()) or v > 0
         assert torch.equal((views.valid[v] > 0.5)[certain], (inside > 0)[certain])
         assert float(views.masks[v][inside < -1].sum()) == 0.0
-
-
-def test_a_capture_takes_part_without_ground_truth(captures):
-    one = draw(
-        [Captures(captures, 32)], (0, 2), inputs=2, targets=1, background=1.0, input_size=32, target_size=16, patch=0
-    )
-    terms = object_losses(ball_model(), one, GAUSSIANS, gradients)
-    assert {"image", "mask", "neutral"} <= set(terms) and not {"material", "normal", "latent"} & set(terms)
-
-
-@pytest.mark.skipif(not REAL.exists(), reason="needs the captures next to the checkout; set RELI3D_CAPTURES")
-def test_uco3d_objects_are_read():
-    found = Captures(REAL, 64)
-    names = [f.name for f in found.folders]
-    index = next(k for k, n in enumerate(names) if n.startswith("UCO3D"))
-    views = found.load(index, range)
-    assert views.images.shape[1:] == (64, 64, 3) and float(views.masks.mean()) > 0.1
 
 
 def test_shards_contain_the_samples_and_any_reader_reads_them(samples, tmp_path):

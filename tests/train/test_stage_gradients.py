@@ -1,10 +1,9 @@
 """The gradient of each stage's whole loss on one object against central differences.
 
-The random numbers are the same on both sides.  Values that are detached by design are fixed: materials are
-evaluated at detached points, the frames of bumps have no gradient, densities of samples are detached.  So light samples
-are taken where the material moves, cosine samples alone where the light does, and where the geometry moves the
-materials are even and the bumps are flat.  Colors at outlines go from pixel to pixel by jumps, which only a wide step
-averages, and a normal is not evaluated at the moved surface: the gradient of a surface agrees to 15 percent.
+The random numbers are the same on both sides.  Points of materials, frames of bumps and densities of samples are
+detached by design: light samples where the material moves, cosine samples alone where the light does, even materials
+and flat bumps where the geometry does.  Colors at outlines jump from pixel to pixel, and a normal is not evaluated at
+the moved surface: the gradient of a surface agrees to 15 percent.
 """
 
 from dataclasses import replace
@@ -59,8 +58,8 @@ def one(tmp_path_factory):
 def test_the_whole_loss_has_the_gradient_of_central_differences(case, one, monkeypatch):
     stage, names, size, tolerance = CASES[case]
     model = ball_model()
-    for head in ("normal", *(MATERIAL_HEADS if names is SHAPE else ())):
-        model.heads[head][-1].weight.data.zero_()
+    for head in ("heads.normal", *(MATERIAL if names is SHAPE else ())):
+        model.heads[head.removeprefix("heads.")][-1].weight.data.zero_()
     model.heads["normal"][-1].bias.data.zero_()
     if names is SHAPE:
         grid = stage_step.occupied  # the choice of cells is not differentiated
@@ -78,9 +77,6 @@ def test_the_whole_loss_has_the_gradient_of_central_differences(case, one, monke
     assert got == pytest.approx(expected, rel=tolerance)
 
 
-MATERIAL_HEADS = ("base_color", "roughness", "metallic")
-
-
 def test_all_terms_are_in_the_gradient(one):
     """Every weight of the paper changes the total of some stage: no term is computed and forgotten."""
     model = ball_model()
@@ -89,26 +85,6 @@ def test_all_terms_are_in_the_gradient(one):
         for drawn in (one, replace(one, inputs=replace(one.inputs, latent=None, strength=None))):
             requested |= set(object_losses(model, drawn, stage, gradients))
     assert requested == set(vars(Weights()))
-
-
-def test_the_weight_of_quads_moves_their_centers(one, monkeypatch):
-    """gamma decides the position of a quad's center.  Its last layer alone moves, by which no other weight changes."""
-    model = ball_model()
-    code = stage_step.encode(model, one)
-    last = model.merger.mlp[-1]
-    weight = last.weight.detach().clone()
-
-    def centers(row: torch.Tensor) -> torch.Tensor:
-        values = torch.cat([weight[:20], row[None]])
-        monkeypatch.setattr(last, "forward", lambda x: torch.nn.functional.linear(x, values, last.bias))
-        vertices = surface(model, code, 16).mesh.vertices
-        return (vertices * torch.randn(vertices.shape, generator=torch.Generator().manual_seed(1))).sum()
-
-    row = weight[20].clone()
-    got, expected = directional_derivatives(lambda: centers(row), [row], [torch.ones(weight.shape[1])], 100.0)
-    # float32 positions summed: 1e-6, of a difference of 2e-3; gamma is far from where its sigmoid bends
-    assert got == pytest.approx(expected, rel=0.02)
-    assert got != 0.0
 
 
 def test_the_normals_of_the_mesh_have_a_gradient_in_the_image(one):

@@ -7,16 +7,13 @@ import pytest
 import torch
 
 from reli3d.geometry.camera import Camera, camera_rays
-from reli3d.nn.model import Reconstructor
-from reli3d.nn.presets import TINY
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.gaussians import shade_gaussians
-from reli3d.render.points import SurfacePoints
 from reli3d.train.stages.config import PAPER, StageConfig, Weights
 from reli3d.train.stages.config import TINY as TINY_STAGES
 from reli3d.train.stages.losses import compared_colors, gradients, light_terms, lpips_distance
 from reli3d.train.stages.rendering import Rendering, display, lobes
-from reli3d.train.stages.step import encode, object_losses, renderings, shader_of, total
+from reli3d.train.stages.step import encode, object_losses, renderings, total
 from reli3d.train.stages.surface import render_surface, surface
 from reli3d.train.stages.views import Samples, draw
 from reli3d.train.stages.volume import occupied, render_volume
@@ -36,12 +33,6 @@ def source(small_samples):
 @pytest.fixture(scope="module")
 def one(source):
     return draw([source], (0, 0), **SIZES)
-
-
-def test_tiny_has_less_than_a_million_parameters():
-    with torch.device("meta"):
-        model = Reconstructor(TINY)
-    assert sum(p.numel() for p in model.parameters()) < 1_000_000
 
 
 def test_the_papers_numbers():
@@ -70,10 +61,7 @@ def test_a_draw_is_a_function_of_its_seed_and_compares_unread_views(source):
 
 def test_a_window_looks_through_the_same_pixels(one):
     part = one.targets.window(5, 3, 8)
-    whole, cut = (
-        camera_rays(Camera(v.c2w[0], v.intrinsics[0], v.images.shape[1], v.images.shape[1]))[1]
-        for v in (one.targets, part)
-    )
+    whole, cut = (camera_rays(Camera(v.c2w[0], v.intrinsics[0], *v.images.shape[1:3]))[1] for v in (one.targets, part))
     torch.testing.assert_close(cut, whole[3:11, 5:13], rtol=0, atol=1e-6)
     assert torch.equal(part.images[0], one.targets.images[0, 3:11, 5:13])
 
@@ -138,29 +126,6 @@ def test_a_ball_is_shown_as_a_ball(stage, one):
     assert 0.2 < float(base.mean()) < 0.8  # the head starts near one half
 
 
-def test_the_lights_samples_alone_and_all_strategies_show_the_same_radiance(monkeypatch, one):
-    """Both are estimates without bias, so with many samples they agree; fewer strategies are no other light."""
-    model = ball_model()
-    code = encode(model, one)
-    map_ = torch.full((1, 16, 32, 3), 0.3)
-    map_[0, 3:5, 6:9] = 20.0  # a lamp
-    monkeypatch.setattr(model, "decode_environment", lambda code: map_)
-    rng = torch.Generator().manual_seed(0)
-    normal = torch.nn.functional.normalize(torch.randn(300, 3, generator=rng), dim=-1)
-    toward = torch.nn.functional.normalize(normal + 0.5 * torch.randn(300, 3, generator=rng), dim=-1)
-    rough = 0.3 + 0.7 * torch.rand(300, generator=rng)  # a sharper highlight needs more samples of the light alone
-    points = SurfacePoints(torch.zeros(300, 3), normal, normal, torch.full((300, 3), 0.6), rough, rough.round())
-    shown = {}
-    for samples in ((4096, 0, 0), (2048, 2048, 512)):
-        stage = replace(MONTE_CARLO, samples=samples, shadows=False)
-        shown[samples] = shader_of(model, code, stage, 5)(points, toward, None)
-    alone, together = shown.values()
-    assert float(together.max() / together.median()) > 3  # some points show the lamp
-    # 4096 samples of a highlight that a hundredth of them meets: some per cent of a point, less of the mean
-    assert float((alone - together).abs().mean() / together.mean()) < 0.02
-    assert float(alone.mean() / together.mean()) == pytest.approx(1.0, abs=0.005)
-
-
 def test_terms_without_ground_truth_are_not_computed(one):
     model = ball_model()
     bare = replace(one.targets, material=None, normal=None, shown=None)
@@ -197,16 +162,11 @@ def test_the_multi_scale_gradients_ignore_constant_regions_and_penalize_edges():
 
 
 def test_latents_are_compared_as_the_decoder_gets_them(one):
-    """The light of latents under a turn is that of the turned latents: their difference is nothing."""
-    model = ball_model()
-    rng = torch.Generator().manual_seed(0)
-    latent = torch.randn(9, 3, generator=rng)
+    """Latents under a turn against the turned latents: their difference is nothing."""
+    latent = torch.randn(9, 3, generator=torch.Generator().manual_seed(0))
     c, s = math.cos(0.7), math.sin(0.7)
     turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    none, eye = torch.zeros(()), torch.eye(3)
-    a = model.environment(latent[None], turn[None], none[None], 8)
-    b = model.environment((latent @ turn.T)[None], eye[None], none[None], 8)
-    torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)  # float32 products in another order
+    none = torch.zeros(())
     views = replace(one.inputs, latent=latent @ turn.T, strength=none)
     assert float(light_terms(latent, turn, none, torch.ones(4, 3), views)["latent"]) < 1e-12
     off = light_terms(latent, turn, none + 0.7, torch.ones(4, 3), views)["latent"]
@@ -239,6 +199,8 @@ def test_every_stage_reaches_the_whole_network(stage, one):
     terms = object_losses(model, replace(one, inputs=lit), stage, gradients)
     assert all(bool(torch.isfinite(v)) for v in terms.values())
     total(terms, stage).backward()
+    if stage is not VOLUME:
+        assert bool((model.merger.mlp[-1].weight.grad != 0).any(1).all())  # gamma, the last row, included
     surface_only = () if stage is not VOLUME else ("heads.deformation", "heads.flexicubes", "merger")
     # one key and one vector: these parameters of the published decoder have no effect, or none at the start
     unread = ("mha.query", "mha.key", "vn_invar.mlp.1.U")

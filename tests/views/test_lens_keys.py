@@ -44,7 +44,7 @@ READ = {
     "width and height": ({"fl_x": 2 * F, "cx": 2 * CX, "cy": 2 * CY, "width": 2 * S, "height": 2 * S}, [F, F, CX, CY]),
     "resolution": ({"fl_x": 2 * F, "resolution": [2 * S, 2 * S]}, MIDDLE),
     "img_wh": ({"fl_x": 2 * F, "img_wh": [2 * S, 2 * S]}, MIDDLE),
-    "two that agree": ({"fl_x": F, "camera_angle_x": FOV, "w": S, "h": S}, MIDDLE),
+    "two that agree": ({"fl_x": F, "camera_angle_x": FOV, "w": float(S), "h": float(S)}, MIDDLE),
 }
 
 
