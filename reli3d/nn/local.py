@@ -400,7 +400,7 @@ class LocalField:
         return torch.cat([self.model.color(features), self.model.surface(features)], -1)
 
     def radiance_map(self, height: int | None = None) -> Tensor:
-        """Linear radiance ``(H, 2H, 3)``, upper edge +Y, horizontal center +X; height: at most, and by default, the preset's."""
+        """Linear radiance ``(H, 2H, 3)``, upper edge +Y, center +X; height: at most the preset's, its default."""
         log = self.log_light
         if height is not None and height < log.shape[1]:
             return functional.adaptive_avg_pool2d(log.exp()[None], (height, 2 * height))[0].permute(1, 2, 0)
