@@ -130,8 +130,22 @@ def test_at_initialization_and_outside_the_object_depths_are_those_predicted(ran
     assert (got != predicted)[inner(views)].float().mean() > 0.9
 
 
-def test_gradients_reach_colors_and_normals(random_model):
-    views = sphere_views(3)
+def test_gradients_reach_inputs_and_parameters(random_model):
+    model, views = random_model, sphere_views(3)
     inputs = {name: views[name].clone().requires_grad_() for name in ("color", "normal")}
-    found(random_model, {**views, **inputs}, views["truth"]).square().sum().backward()
-    assert all(value.grad.abs().sum() > 0 for value in inputs.values())
+
+    def loss(views: dict) -> Tensor:
+        return (found(model, views, views["truth"]) - views["truth"]).square().sum()
+
+    loss({**views, **inputs}).backward()
+    weight, step = model.match[2].weight, 1e-2
+    index = tuple(int(k) for k in torch.unravel_index(weight.grad.abs().argmax(), weight.shape))
+    values = []
+    with torch.no_grad():
+        for sign in (1.0, -2.0):
+            weight[index] += sign * step
+            values.append(float(loss(views)))
+    # a central difference of a float32 sum over some thousand pixels
+    assert float(weight.grad[index]) == pytest.approx((values[0] - values[1]) / (2 * step), rel=0.05)
+    without = {id(model.regular[4].bias), id(model.widening)}  # the bias shifts all scores
+    assert all(t.grad.abs().sum() > 0 for t in (*inputs.values(), *model.parameters()) if id(t) not in without)
