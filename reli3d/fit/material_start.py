@@ -19,7 +19,7 @@ TRIAL_METALLIC = {"metal": 0.95, "nonmetal": 0.05}
 TRIAL = 0.08  # fraction of the budget for each of the three fits
 # Ratio to the start's error up to which the nonmetal is preferred if it fits better than the metal: half metals fit
 # images of nonmetals almost as well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for glossy
-# nonmetals, 1.10 to 1.29 for others; for a painted metal 0.99 to 1.02, but the metal fits better there.
+# nonmetals, 1.10 to 1.29 for others; for a painted metal 0.99 to 1.02, where the metal does not always fit better.
 PREFERENCE = 1.05
 MIN_STEPS = 30  # of each fit; after fewer, the start that needs fewer changes has the smaller error
 MIN_BASE_COLOR = 0.02

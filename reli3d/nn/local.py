@@ -181,10 +181,10 @@ class LocalReconstructor(nn.Module):
         images: ``(V, S, S, 3)`` sRGB in [0, 1], not premultiplied by the mask.  masks: ``(V, S, S)``.  c2w: ``(V, 4,
         4)`` OpenGL.  intrinsics: ``(V, 4)`` in pixels of ``images``.  detail: ``(V, D, D, 4)``, sRGB and signed
         silhouette distance in pixels, from which colors are read.  detail_intrinsics: ``(V, 4)`` in its pixels.
-        mirrored: number of views at the end that are the first views, flipped left to right, with mirrored cameras;
-        they are used for shape and material, not for lighting.  inference: without gradient, by fused kernels, equal to
-        float32 rounding.  Gradients reach every parameter, those of the cost volume with two or more input views.
-        Raises ValueError if more than half of the views are mirrored.
+        mirrored: number of views at the end that are the first views, flipped left to right, with mirrored cameras, for
+        shape and material alone.  inference: without gradient, by fused kernels, equal to float32 rounding.  Gradients
+        reach every parameter, those of the cost volume from two input views.  Raises ValueError if more than half of
+        the views are mirrored.
         """
         with torch.set_grad_enabled(torch.is_grad_enabled() and not inference):
             views = images, masks, c2w, intrinsics, detail, detail_intrinsics
