@@ -30,15 +30,7 @@ FORMATS = ("PNG", "JPEG", "WEBP", "TIFF")  # nothing that runs a program or unpa
 MAX_SCANS = 100  # progressive files have about ten; a thousand in a small file take minutes
 ORIENTATION = 0x0112  # of EXIF
 QUARTER_TURNS = (5, 6, 7, 8)  # orientations that exchange the sides
-UNTURNED = {  # what restores the stored pixels
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_90,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_270,
-}
+INVERSES = {6: 8, 8: 6}  # of orientations; the others are their own inverses
 _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # start of a JPEG segment; other bytes after 0xff are data
 ASPECT = 0.01  # relative difference up to which two sizes have the same aspect
 _TOP = {"L": 255, "RGB": 255, "RGBA": 255, "F": 65535}  # mode: the value that is 1
@@ -144,16 +136,16 @@ def _decoded(
         name = f"{os.path.basename(path)}: EXIF orientation {shown(orientation)}"
         tiff = image.format == "TIFF"  # Pillow turns it and exchanges the sides before
         stored = image.size[::-1] if tiff and orientation in QUARTER_TURNS else image.size
-        fits = calibrated and _aspect(calibrated, stored[::-1]) and not _aspect(calibrated, stored)
+        fits = calibrated is not None and _aspect(calibrated, stored[::-1]) and not _aspect(calibrated, stored)
         applied = upright or fits
         if calibrated and fits:
             notes.append(f"{name} applied: the camera file has {calibrated[0]} x {calibrated[1]} pixels")
         elif not upright:
             notes.append(f"{name} not applied, cameras refer to stored pixels")
-        if tiff:
+        if tiff and not applied:
             image.load()
-            image = image if applied or orientation not in UNTURNED else image.transpose(UNTURNED[orientation])
-        elif applied:
+            image.getexif()[ORIENTATION] = INVERSES.get(orientation, orientation)
+        if applied != tiff:
             image = ImageOps.exif_transpose(image)
     check_depth(path, image)
     image = in_srgb(image, os.path.basename(path), notes)

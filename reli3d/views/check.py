@@ -105,8 +105,8 @@ def _filled(hull: Hull, mask: Tensor, pose: Tensor, camera: Tensor) -> float:
     return float((hit & blocks).sum() / blocks.sum().clamp_min(1))
 
 
-def _alternatives(views: Views):
-    """``(mistake, remedy, corrected views)`` of the common mistakes."""
+def _alternatives(views: Views) -> list[tuple[str, str, Tensor]]:
+    """``(mistake, remedy, corrected poses)`` of the common mistakes."""
     c2w = views.c2w
     flip = c2w.new_tensor([1.0, -1.0, -1.0, 1.0])  # of the columns
     given = c2w.double()
@@ -118,7 +118,7 @@ def _alternatives(views: Views):
     negate, transpose = "negate the second and third column of each matrix", "transpose the 3x3 blocks"
     quarter = "the images look turned by 90 degrees (an EXIF orientation that was applied or lost?)"
     exchanged = c2w[..., [1, 0, 2, 3]]
-    cases = (
+    return [
         (f"the camera axes look flipped: {flipped}", negate, c2w * flip),
         ("the matrices look like world-to-camera", "store their inverses", inverse),
         ("the matrices look like world-to-camera in OpenCV axes", f"invert, then {negate}", inverse * flip),
@@ -127,9 +127,7 @@ def _alternatives(views: Views):
         ("the images look upside down", "turn them by 180 degrees", c2w * c2w.new_tensor([-1.0, -1.0, 1.0, 1.0])),
         (quarter, "store them as they were calibrated", exchanged * c2w.new_tensor([-1.0, 1.0, 1.0, 1.0])),
         (quarter, "store them as they were calibrated", exchanged * c2w.new_tensor([1.0, -1.0, 1.0, 1.0])),
-    )
-    for what, fix, poses in cases:
-        yield what, fix, replace(views, c2w=poses)
+    ]
 
 
 def _verdict(views: Views, hull: Hull, filled: list[float]) -> str:
@@ -141,8 +139,8 @@ def _verdict(views: Views, hull: Hull, filled: list[float]) -> str:
         return _single(views, hull)
     given = sum(filled) / len(filled)
     cause, fix, best = "", "", 1.0 - (1.0 - given) / BETTER
-    for what, how, other in _alternatives(views) if given < SURELY_FILLED else ():
-        score = sum(agreement(other)[1]) / len(views)
+    for what, how, poses in _alternatives(views) if given < SURELY_FILLED else ():
+        score = sum(agreement(replace(views, c2w=poses))[1]) / len(views)
         if score >= max(best, MIN_FILLED):
             cause, fix, best = what, how, score
     if cause:

@@ -121,32 +121,22 @@ def is_within(root: Path, path: Path) -> bool:
 
 
 def check_distortion(where: str, lens: Lens, focal: float, reach: tuple[float, float]) -> list[str]:
-    """A note if ``lens`` has distortion of at most MAX_DISTORTION_PIXELS.  Raises InputError for larger distortion.
+    """A note if ``lens`` displaces pixels by at most MAX_DISTORTION_PIXELS (OpenCV's polynomial), else InputError.
 
-    reach: largest distance of pixels from the principal point, in x and y.
+    reach: largest distance [px] of pixels from the principal point, in x and y.  The displacement is evaluated from the
+    principal point to there, as coefficients of opposite sign cancel at the corner and not before it.
     """
     if not any(lens.radial + lens.tangential):
         return []
-    moved = distortion_pixels(focal, reach, lens.radial, lens.tangential)
+    p1, p2 = lens.tangential or (0.0, 0.0)
+    with np.errstate(all="ignore"):  # a focal length next to nothing gives infinity or NaN
+        x, y = np.outer(np.divide(reach, focal), np.arange(1, RADII + 1) / RADII)
+        r2 = x * x + y * y
+        factor = np.abs(np.polyval((*lens.radial[::-1], 0.0), r2))
+        dx = x * factor + abs(2 * p1) * x * y + abs(p2) * (r2 + 2 * x * x)
+        dy = y * factor + abs(p1) * (r2 + 2 * y * y) + abs(2 * p2) * x * y
+        moved = float((focal * np.hypot(dx, dy)).max())
     if not moved <= MAX_DISTORTION_PIXELS:
         got = f"expected an undistorted lens, got a displacement of {moved:.3g} pixels"
         raise InputError(where, f"distortion: {got}; undistort the images (colmap image_undistorter)")
     return [f"{where}: lens distortion of at most {moved:.2g} pixels ignored"]
-
-
-def distortion_pixels(
-    focal: float, reach: tuple[float, float], radial: tuple[float, ...], tangential: tuple[float, ...]
-) -> float:
-    """Largest displacement [px] by a polynomial lens: radial k1, k2, ..., tangential p1, p2 (OpenCV).
-
-    Evaluated from the principal point to ``reach`` [px], as coefficients of opposite sign cancel at the corner and not
-    before it.
-    """
-    p1, p2 = tangential or (0.0, 0.0)
-    with np.errstate(all="ignore"):  # a focal length next to nothing gives infinity or NaN
-        x, y = np.outer(np.divide(reach, focal), np.arange(1, RADII + 1) / RADII)
-        r2 = x * x + y * y
-        factor = np.abs(np.polyval((*radial[::-1], 0.0), r2))
-        dx = x * factor + abs(2 * p1) * x * y + abs(p2) * (r2 + 2 * x * x)
-        dy = y * factor + abs(p1) * (r2 + 2 * y * y) + abs(2 * p2) * x * y
-        return float((focal * np.hypot(dx, dy)).max())

@@ -138,11 +138,6 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
     A null is no value.  Raises InputError naming the field if the values are not a lens or if two keys disagree.
     """
     frame, data = ({k: v for k, v in source.items() if v is not None} for source in (frame, data))
-
-    def found(key: str, low: float = -1e6, high: float = 1e6) -> float | None:
-        value = frame.get(key, data.get(key))
-        return None if value is None else number(where, key, value, low, high)
-
     size, center = _size(where, frame, data), _center(where, frame, data)
     lens = None
     for source in (frame, data):
@@ -166,8 +161,11 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
                 raise InputError(where, f"{problem}, {fix}")
         notes.append(f"{where}: no field of view given, {DEFAULT_FOV} radians assumed as in the ReLi3D release")
         lens = Lens(fov=(DEFAULT_FOV, math.nan), center=center)
-    radial, tangential = (tuple(found(k) or 0.0 for k in keys) for keys in (_RADIAL, _TANGENTIAL))
-    model = frame.get("camera_model", data.get("camera_model"))
+    both = {**data, **frame}
+    radial, tangential = (
+        tuple(number(where, k, both.get(k, 0.0), -1e6, 1e6) for k in keys) for keys in (_RADIAL, _TANGENTIAL)
+    )
+    model = both.get("camera_model")
     if radial[3] and isinstance(model, str) and model.upper() == "FULL_OPENCV":  # of a denominator there
         raise InputError(where, f"k4: expected 0 for FULL_OPENCV, got {radial[3]:g}; undistort the images first")
     return replace(lens, radial=radial, tangential=tangential)

@@ -17,6 +17,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from scipy.ndimage import map_coordinates
 
 from reli3d.geometry.bake import bake
 from reli3d.geometry.tangents import encode_normals
@@ -132,12 +133,9 @@ def test_trimesh_reads_the_same_surface_and_colors(asset, tmp_path):
     w = rng.dirichlet((1, 1, 1), 20_000)[:, :, None]
     face = asset.mesh.faces.numpy()[rng.integers(0, len(asset.mesh.faces), len(w))]
     uv, p = (asset.mesh.uv.numpy()[face] * w).sum(1), (asset.mesh.vertices.numpy()[face] * w).sum(1)
-    at = uv * SIZE - 0.5
-    low, error = np.floor(at).astype(int), 0.0
-    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        f = np.abs(1 - np.array([dx, dy]) - (at - low)).prod(1)
-        error = error + f[:, None] * image[np.clip(low[:, 1] + dy, 0, SIZE - 1), np.clip(low[:, 0] + dx, 0, SIZE - 1)]
-    assert np.abs(error - color(torch.from_numpy(p)).numpy()).mean() < STEP
+    at = (uv * SIZE - 0.5)[:, ::-1].T  # rows, columns
+    found = np.stack([map_coordinates(image[..., k], at, order=1, mode="nearest") for k in range(3)], -1)
+    assert np.abs(found - color(torch.from_numpy(p)).numpy()).mean() < STEP
 
 
 @pytest.mark.parametrize("byte", [0, 37, 255])
@@ -222,53 +220,6 @@ def test_real_files_are_read_as_trimesh_reads_them(shared_data):
         assert sum(len(p.mesh.faces) for p in parts) == len(shape.faces)
         low = torch.stack([p.mesh.vertices.min(0).values for p in parts]).min(0).values
         assert np.allclose(low, shape.bounds[0], atol=1e-5)
-
-
-def change(path, value):
-    def apply(document):
-        node = document
-        for key in path[:-1]:
-            node = node[key]
-        if value is None:
-            del node[path[-1]]
-        else:
-            node[path[-1]] = value
-
-    return apply
-
-
-HOSTILE = {
-    "count": (change(["accessors", 0, "count"], 10**9), "accessors[0].count: expected at most"),
-    "range": (change(["accessors", 0, "count"], 10**6), "accessors[0].count: expected a range within"),
-    "negative": (change(["accessors", 0, "byteOffset"], -4), "accessors[0].count: expected a range"),
-    "view": (change(["bufferViews", 0, "byteLength"], 2**40), "bufferViews[0].byteLength: expected a range within"),
-    "type": (change(["accessors", 0, "type"], "VEC2"), "accessors[0].type: expected VEC3"),
-    "component": (change(["accessors", 0, "componentType"], 7), "accessors[0].componentType"),
-    "index": (change(["meshes", 0, "primitives", 0, "indices"], 0), "accessors[0].type: expected SCALAR"),
-    "no mesh": (change(["nodes", 0, "mesh"], 9), "nodes[0].mesh: expected an index into 1 meshes"),
-    "cycle": (change(["nodes", 0, "children"], [0]), "nodes[0]: expected a tree"),
-    "uri": (change(["buffers", 0, "uri"], "../../etc/passwd"), "buffers[0].uri: expected data inside the file"),
-    "url": (change(["images", 0], {"uri": "https://a.b/c.png"}), "images[0].uri: expected data inside the file"),
-    "draco": (change(["extensionsRequired"], ["KHR_draco_mesh_compression"]), "extensionsRequired: expected none"),
-    "huge": (change(["nodes", 0, "scale"], [1e300, 1, 1]), "expected values within the range of float32"),
-    "text": (change(["nodes", 0, "scale"], ["1", 1, 1]), "nodes[0].scale: expected float"),
-    "image": (change(["images", 0, "bufferView"], 0), "images[0]: expected a PNG, JPEG or WebP image"),
-    "version": (change(["asset", "version"], "1.0"), "asset.version: expected 2.x"),
-    "nothing": (change(["scenes", 0, "nodes"], []), "expected triangles in its scene"),
-    "sparse": (change(["accessors", 0, "sparse"], {"count": 1}), "accessors[0].sparse.indices: expected an object"),
-    "points": (change(["meshes", 0, "primitives", 0, "mode"], 0), "expected triangles in its scene"),
-}
-
-
-@pytest.mark.parametrize("case", HOSTILE)
-def test_hostile_files_are_refused_by_name(asset, tmp_path, case):
-    apply, message = HOSTILE[case]
-    document, binary = parsed(glb_bytes(asset))
-    apply(document)
-    (tmp_path / "a.glb").write_bytes(packed(document, binary))
-    with pytest.raises(ValueError) as error:
-        read_glb(tmp_path / "a.glb")
-    assert message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_indices_and_nan_in_the_buffer_are_refused_and_limits_kept(asset, tmp_path):

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from reli3d.errors import InputError
 from reli3d.io.glb import read_glb, write_glb
@@ -275,6 +276,18 @@ def test_extensions_that_core_gltf_approximates_are_noted_and_others_refused(tmp
         quad.document["extensionsRequired"] = [name]
         with pytest.raises(InputError, match=f"extensionsRequired: expected none that must be decoded, got .'{name}"):
             quad.read(tmp_path)
+
+
+def test_an_image_of_twenty_materials_is_decoded_once(tmp_path, monkeypatch):
+    quad = Quad(normalTexture={"index": 0})
+    quad.texture(noise(32, 32, 3))
+    quad.document["textures"] *= 20
+    quad.document["materials"] = [{"normalTexture": {"index": k}, "name": str(k)} for k in range(20)]
+    quad.document["meshes"][0]["primitives"] = [{**quad.primitive, "material": k} for k in range(20)]
+    (tmp_path / "a.glb").write_bytes(quad.data())
+    opened, real = [], Image.open
+    monkeypatch.setattr(Image, "open", lambda *args, **options: opened.append(1) or real(*args, **options))
+    assert len(read_glb(tmp_path / "a.glb")) == 20 and len(opened) == 1
 
 
 def test_compressed_data_without_a_fallback_are_refused(tmp_path):

@@ -108,6 +108,8 @@ REFUSED = [
     *[{**keys, "fl_x": F} for keys in each(D=[-0.3, 0.1, 0, 0, 0], dist=[-0.3, 0.1, 0, 0])],
     {"camera_model": "OPENCV_FISHEYE", "k1": 0.0, "k2": 0.0, "k3": 0.0, "k4": 0.0},
     {"k1": 3.0, "k2": -18.0},
+    *({"w": w, "h": h, "fl_x": F} for w, h in ((0.5, 8), (8, 1e-300))),  # divisions by zero, as the next three
+    *each(fov_rad=5e-324, camera_fov=[0.7, 5e-324], camera_angle_x=1e-320),
     {"fl_x": F, "cx": 0.5, "cy": 0.5},
     {"fl_x": F, "camera_angle_x": 1.2, "w": S, "h": S},
     {"K": K, "fl_x": 80.0, "w": S, "h": S},
@@ -134,6 +136,7 @@ WEAK = 0.5 * 1.5 * 0.5 / F / CORNER2**1.5  # k1 of 0.75 / 2 pixels at the corner
     "frame, keys, refused",
     [
         ({}, {"k1": 3.0, "k2": -3.0 / CORNER2}, True),  # 3 r^3 - 3 r^5 / r2 is 0 at the corner, and not before it
+        ({"fl_x": 1e-100}, {"k1": 0.1, "k2": 0.1, "k3": 0.1}, True),  # NaN
         ({"k1": None}, {"k1": 0.5}, True),  # null in a frame leaves that of the file
         ({}, {"k1": WEAK}, False),
         ({}, {"k1": WEAK, "cx": 4.0, "cy": 4.0}, True),  # it counts from the principal point
