@@ -7,15 +7,8 @@ import pytest
 import torch
 
 from reli3d.errors import InputError
-from reli3d.io.hdr import (
-    HALF_MAX,
-    read_environment,
-    read_hdr_image,
-    rgbe_bytes,
-    write_environment,
-    write_exr,
-    write_hdr,
-)
+from reli3d.io.hdr import HALF_MAX, read_environment, read_hdr_image, write_environment, write_exr, write_hdr
+from reli3d.io.rgbe import rgbe_bytes
 from reli3d.render.environment import Environment
 
 

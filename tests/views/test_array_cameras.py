@@ -23,11 +23,12 @@ def rig():
     return sphere_views(count=COUNT, size=(WIDTH, HEIGHT))
 
 
-def images(folder, rig, names, scale=1):
+def images(folder, rig, names, scale=1, mode="RGBA"):
     folder.mkdir(parents=True)
     for name, mask in zip(names, rig.masks):
         pixels = np.repeat((mask.numpy() * 255).astype(np.uint8)[..., None], 4, -1)
-        Image.fromarray(pixels).resize((WIDTH // scale, HEIGHT // scale), Image.Resampling.BOX).save(folder / name)
+        image = Image.fromarray(pixels).resize((WIDTH // scale, HEIGHT // scale), Image.Resampling.BOX)
+        image.convert(mode).save(folder / name)
 
 
 def llff(folder, rig, place="images", scale=1):
@@ -68,12 +69,8 @@ def projections(rig, moved, size):
 
 
 def neus(folder, rig, **changes):
-    images(folder / "image", rig, [f"{j:06d}.png" for j in range(COUNT)])
-    (folder / "mask").mkdir()
-    for j, mask in enumerate(rig.masks):
-        Image.fromarray((mask.numpy() * 255).astype(np.uint8)).convert("RGB").save(folder / f"mask/{j:03d}.png")
-        image = Image.open(folder / f"image/{j:06d}.png").convert("RGB")
-        image.save(folder / f"image/{j:06d}.png")
+    images(folder / "image", rig, [f"{j:06d}.png" for j in range(COUNT)], mode="RGB")
+    images(folder / "mask", rig, [f"{j:03d}.png" for j in range(COUNT)], mode="RGB")
     whole = replace(rig, intrinsics=rig.intrinsics - torch.tensor([0.0, 0.0, 0.5, 0.5]))  # NeuS' pixel centers
     np.savez(folder / "cameras_sphere.npz", **{**projections(whole, np.array([3.0, -40.0, 700.0]), 25.0), **changes})
 
@@ -152,15 +149,10 @@ def test_another_number_of_masks_is_refused(tmp_path, rig):
 
 def test_splits_of_nerf_synthetic(tmp_path, rig):
     """The training split, and a note of the others; another split where that is missing."""
-    for split, part in (("train", slice(0, 3)), ("test", slice(3, 4)), ("val", slice(4, 5))):
-        names = [f"r_{j}.png" for j in range(COUNT)][part]
-        folder = tmp_path / split
-        folder.mkdir()
-        for name, mask in zip(names, rig.masks[part]):
-            Image.fromarray(np.repeat((mask.numpy() * 255).astype(np.uint8)[..., None], 4, -1)).save(folder / name)
+    for split, numbers in (("train", [0, 1, 2]), ("test", [3]), ("val", [4])):
+        images(tmp_path / split, rig.select(numbers), [f"r_{j}.png" for j in numbers])
         frames = [
-            {"file_path": f"./{split}/{name[:-4]}", "rotation": 0.0, "transform_matrix": pose.tolist()}
-            for name, pose in zip(names, rig.c2w[part])
+            {"file_path": f"./{split}/r_{j}", "rotation": 0.0, "transform_matrix": rig.c2w[j].tolist()} for j in numbers
         ]
         (tmp_path / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
     views = load_views(tmp_path)

@@ -14,13 +14,6 @@ def listing(folder: Path) -> list:
     return sorted((str(p), p.lstat().st_size, p.lstat().st_mtime_ns) for p in folder.rglob("*"))
 
 
-def one_clear_line(error: BaseException) -> None:
-    text = str(error)
-    assert type(error) is InputError  # a ValueError; nothing of the decoder or of Python's file calls leaks through
-    assert text.isprintable() and len(text) < 600, text
-    assert ": " in text and ("; " in text or "expected" in text), text  # names a place, and what to do
-
-
 def test_the_untouched_folders_load(tmp_path):
     hostile.good(tmp_path / "json")
     hostile.colmap(tmp_path / "colmap")
@@ -29,22 +22,24 @@ def test_the_untouched_folders_load(tmp_path):
     assert read_environment(tmp_path / "good.exr").radiance.shape == (16, 32, 3)
 
 
-@pytest.mark.parametrize("name, make", hostile.cases(), ids=[name for name, _ in hostile.cases()])
-def test_a_malformed_folder_gives_one_line(tmp_path, capfd, name, make):
+CASES = [
+    *((name, make, load_views) for name, make in hostile.cases()),
+    *(
+        (name, lambda path, content=content: path.write_bytes(content), read_environment)
+        for name, content in hostile_maps.cases()
+    ),
+]
+
+
+@pytest.mark.parametrize("make, read", [case[1:] for case in CASES], ids=[case[0] for case in CASES])
+def test_a_malformed_input_gives_one_line(tmp_path, capfd, make, read):
     make(tmp_path / "object")
     before = listing(tmp_path)
     with pytest.raises(InputError) as caught:
-        load_views(tmp_path / "object")
-    one_clear_line(caught.value)
+        read(tmp_path / "object")
+    text = str(caught.value)
+    assert type(caught.value) is InputError  # nothing of the decoder or of Python's file calls leaks through
+    assert text.isprintable() and len(text) < 600, text
+    assert ": " in text and ("; " in text or "expected" in text), text  # names a place, and what to do
     assert listing(tmp_path) == before
     assert capfd.readouterr() == ("", "")  # nothing but the error
-
-
-@pytest.mark.parametrize("name, content", hostile_maps.cases(), ids=[name for name, _ in hostile_maps.cases()])
-def test_a_malformed_map_gives_one_line(tmp_path, capfd, name, content):
-    path = tmp_path / "map.hdr"
-    path.write_bytes(content)
-    with pytest.raises(InputError) as caught:
-        read_environment(path)
-    one_clear_line(caught.value)
-    assert capfd.readouterr() == ("", "")
