@@ -37,7 +37,8 @@ def no_cameras(source: Path) -> InputError:
             return InputError(raw[0], "expected JPEG, HEIC or PNG photographs; convert them, full size and uncropped")
     ready = [p for p in folders if any((p / name).exists() for name in CAMERA_FILES)]
     if ready:
-        return InputError(source, f"expected one object, got {len(ready)} folders of objects; give {_quoted(ready[0])}")
+        one = shlex.quote(str(ready[0]))
+        return InputError(source, f"expected one object, got {len(ready)} folders of objects; give {one}")
     for folder in folders:
         for place in (folder / "images", folder):
             if len(photographs := images_in(place, PHOTOGRAPHS)) > 1:
@@ -50,9 +51,5 @@ def _capture(source: Path, place: Path, got: str, target: Path | None = None) ->
     out = base.with_name(f"{base.stem if base.is_file() else base.name}-object")
     if not (target or source).is_absolute():
         out = Path(os.path.relpath(out))
-    command = f"reli3d capture {_quoted(place)} {_quoted(out)}"
+    command = shlex.join(["reli3d", "capture", str(place), str(out)])
     return InputError(source, f"expected a folder with cameras, got {got} without; run: {command}")
-
-
-def _quoted(path: Path) -> str:
-    return shlex.quote(str(path))

@@ -172,13 +172,7 @@ def _cut(image: Tensor, mask: Tensor, x: int, y: int, width: int, height: int) -
     left, top = max(0, -x), max(0, -y)
     right, bottom = max(0, x + width - columns), max(0, y + height - rows)
     inner = slice(y + top, y + height - bottom), slice(x + left, x + width - right)
-    pixels = torch.empty((5, height - top - bottom, width - left - right), device=image.device, dtype=torch.float32)
-    pixels[:3] = image[inner].permute(2, 0, 1)
-    pixels[3:] = mask[inner]
-    if not (left or top or right or bottom):
-        return pixels
-    pixels = pad(pixels[None], (left, right, top, bottom), mode="replicate")[0]
-    outside = torch.ones((height, width), dtype=torch.bool, device=mask.device)
-    outside[top : height - bottom, left : width - right] = False
-    pixels[3][outside] = 0.0
-    return pixels
+    around = (left, right, top, bottom)
+    pixels = torch.cat([image[inner].permute(2, 0, 1), mask[inner][None]])
+    pixels = pad(pixels[None], around, mode="replicate")[0]
+    return torch.cat([pixels[:3], pad(mask[inner][None], around), pixels[3:]])

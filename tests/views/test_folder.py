@@ -50,10 +50,13 @@ def test_object_folder_as_published(tmp_path):
     assert "0.7 radians" in views.notes[0]
 
 
-def test_blender_folder(tmp_path):
+@pytest.mark.parametrize(
+    "lens, angle", [({"camera_angle_x": 0.69}, 0.69), ({"camera_fov": 0.6}, 0.6), ({"fov_rad": [0.6]}, 0.6), ({}, 0.7)]
+)
+def test_blender_folder_and_one_angle(tmp_path, lens, angle):
     photo(tmp_path / "train/r_0.png")
-    angle, frame = 0.6911112070083618, {"file_path": "./train/r_0", "rotation": 0.1}
-    transforms(tmp_path, [frame | {"transform_matrix": hostile.pose(0.3)}], camera_angle_x=angle)
+    frame = {"file_path": "./train/r_0", "rotation": 0.1, "transform_matrix": hostile.pose(0.3)}
+    transforms(tmp_path, [frame], **lens)
     views = load_views(tmp_path)
     focal = 0.5 * 40 / math.tan(0.5 * angle)  # the focal length of x serves y: square pixels
     torch.testing.assert_close(views.intrinsics, torch.tensor([[focal, focal, 20.0, 15.0]]))

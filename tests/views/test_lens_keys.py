@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from reli3d.errors import InputError
 from reli3d.views.folder import load_views
@@ -171,14 +170,3 @@ def test_a_byte_order_mark_is_read_over(tmp_path):
     data = (tmp_path / "transforms.json").read_bytes()
     (tmp_path / "transforms.json").write_bytes(b"\xef\xbb\xbf" + data)
     np.testing.assert_allclose(load_views(tmp_path).intrinsics, [MIDDLE], rtol=1e-6)
-
-
-@pytest.mark.parametrize("lens", [{"camera_fov": 0.6}, {"fov_rad": [0.6]}, {}])
-def test_one_angle_means_square_pixels(tmp_path, lens):
-    pixels = np.zeros((30, 40, 4), np.uint8)
-    pixels[8:22, 10:30] = 255
-    Image.fromarray(pixels).save(tmp_path / "a.png")
-    frame = {"file_path": "a.png", "transform_matrix": hostile.pose(0), **lens}
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
-    fx, fy = load_views(tmp_path).intrinsics[0, :2].tolist()
-    assert fx == fy == pytest.approx(20 / math.tan(0.5 * (0.6 if lens else 0.7)), rel=1e-6)
