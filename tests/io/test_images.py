@@ -122,14 +122,12 @@ def test_png_round_trip(tmp_path):
     assert np.asarray(Image.open(tmp_path / "b.png")).tolist() == [[[0, 0, 127], [128, 255, 255]]]
 
 
-@pytest.mark.parametrize("shape", [(4, 4, 2), (0, 4, 3), (4,)])
-def test_png_refuses(shape):
-    with pytest.raises(ValueError, match="pixels: expected"):
-        png_bytes(torch.zeros(shape))
+def test_png_refuses():
+    for pixels in (*map(torch.zeros, ((4, 4, 2), (0, 4, 3), (4,))), torch.full((4, 4, 3), math.nan)):
+        with pytest.raises(ValueError, match="pixels: expected"):
+            png_bytes(pixels)
     with pytest.raises(TypeError, match="pixels: expected"):
         png_bytes(torch.zeros(4, 4, 3).long())
-    with pytest.raises(ValueError, match="pixels: expected"):
-        png_bytes(torch.full((4, 4, 3), math.nan))
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:

@@ -74,10 +74,18 @@ def test_near_duplicates_and_a_narrow_baseline_are_reported():
     assert narrow.startswith("narrow baseline: all views lie within 20.0 degrees")
 
 
-def folder(path, cameras) -> None:
+def folder(path, cameras, cut_off=()) -> None:
+    """A folder of views, of which those in ``cut_off`` show the object at the border."""
     data = hostile.good(path, len(cameras))
-    frames = [frame | {"transform_matrix": c.tolist()} for frame, c in zip(data["frames"], cameras, strict=True)]
-    (path / "transforms.json").write_text(json.dumps({**data, "frames": frames}))
+    for k, (frame, c2w) in enumerate(zip(data["frames"], cameras, strict=True)):
+        frame |= {"transform_matrix": c2w.tolist(), "file_path": f"rgba/{k:02d}.png"}
+        pixels = np.roll(hostile.random_image(), hostile.SIDE // 2 if k in cut_off else 0, 1)
+        Image.fromarray(pixels).save(path / frame["file_path"])
+    (path / "transforms.json").write_text(json.dumps(data))
+
+
+def around(count) -> torch.Tensor:
+    return rig(*[(360 * k / count, 20, 2) for k in range(count)])
 
 
 def test_a_folder_of_sixty_is_read_as_its_four_distinct_views(tmp_path):
@@ -94,19 +102,8 @@ def test_a_folder_of_sixty_is_read_as_its_four_distinct_views(tmp_path):
     assert len(load_views(tmp_path, views=MAX_VIEWS)) == MAX_VIEWS
 
 
-def cut_off(path, count, which) -> None:
-    """A folder of ``count`` views around, of which those in ``which`` show the object at the border."""
-    folder(path, rig(*[(360 * k / count, 20, 2) for k in range(count)]))
-    data = json.loads((path / "transforms.json").read_text())
-    for k, frame in enumerate(data["frames"]):
-        pixels = hostile.random_image()
-        frame["file_path"] = f"rgba/{k:02d}.png"
-        Image.fromarray(np.roll(pixels, hostile.SIDE // 2, 1) if k in which else pixels).save(path / frame["file_path"])
-    (path / "transforms.json").write_text(json.dumps(data))
-
-
 def test_views_that_cut_the_object_off_are_left_out_while_eight_remain(tmp_path):
-    cut_off(tmp_path / "twelve", 12, (0, 3, 7))
+    folder(tmp_path / "twelve", around(12), (0, 3, 7))
     others = tuple(f"rgba/{k:02d}.png" for k in range(12) if k not in (0, 3, 7))
     named = "3 masks touch the image's border, where the object is cut off: 0 (rgba/00.png), 3 (rgba/03.png), 7"
     views = load_views(tmp_path / "twelve")
@@ -116,13 +113,13 @@ def test_views_that_cut_the_object_off_are_left_out_while_eight_remain(tmp_path)
     every = load_views(tmp_path / "twelve", every=True)
     assert len(every) == 12 and every.taken().names == others
     assert set(load_views(tmp_path / "twelve", views=4).names) <= set(others)
-    cut_off(tmp_path / "ten", 10, (0, 3, 7))  # seven others
+    folder(tmp_path / "ten", around(10), (0, 3, 7))  # seven others
     views = load_views(tmp_path / "ten")
     assert len(views) == 10 and any(n.startswith(named) and n.endswith("; used all the same") for n in views.notes)
 
 
 def test_of_many_views_that_all_cut_the_object_off_none_is_left_out(tmp_path):
-    cut_off(tmp_path, 18, range(18))
+    folder(tmp_path, around(18), range(18))
     views = load_views(tmp_path)
     assert len(views) == 16 and views.names[0] == "rgba/00.png"
     assert any(n.endswith("; used all the same") for n in views.notes)
@@ -130,6 +127,6 @@ def test_of_many_views_that_all_cut_the_object_off_none_is_left_out(tmp_path):
 
 
 def test_of_many_views_those_that_cut_the_object_off_are_replaced(tmp_path):
-    cut_off(tmp_path, 24, range(0, 24, 3))
+    folder(tmp_path, around(24), range(0, 24, 3))
     views = load_views(tmp_path)
     assert len(views) == 16 and not any(int(name[5:7]) % 3 == 0 for name in views.names)
