@@ -53,11 +53,7 @@ class Placed:
 
 
 class Document:
-    """A parsed GLB: typed access to its JSON and its accessors.
-
-    Every getter raises InputError with the place in the file for a wrong type, index or range.  Omissions are
-    appended to ``notes``, one line each.
-    """
+    """A parsed GLB: typed access to its JSON and its accessors.  notes: omissions, one line each."""
 
     def __init__(self, path: str | os.PathLike, *, max_bytes: int = 1 << 29, max_vertices: int = 20_000_000):
         self.path, self.max_bytes, self.max_vertices = path, max_bytes, max_vertices

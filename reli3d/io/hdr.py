@@ -2,9 +2,6 @@
 
 Pixels are linear Rec. 709 radiance.  The upper edge of an environment is +Y, the horizontal center +X, and +Z is right
 of the center, in files and in memory: the convention of three.js, model-viewer and Blender.
-
-Writing raises an error for NaN and negative values; infinity and, in half precision, values above 65504 are clamped to
-65504.  Reading raises an error for NaN, sets negative values to 0 and infinity to 65504.
 """
 
 import os
@@ -73,7 +70,7 @@ def read_hdr_image(path: str | os.PathLike, *, notes: list[str] | None = None) -
     """Reads a linear Rec. 709 image ``(H, W, 3)``, float32, finite and not negative, from an ``.hdr`` or ``.exr`` file.
 
     For OpenEXR, the image is the display window, black outside the data window.  Colors in other primaries are
-    converted.  ``notes`` and errors as in :func:`read_environment`.
+    converted.  Negative values are set to 0, infinity to 65504.  ``notes`` and errors as in :func:`read_environment`.
     """
     with opened(path) as file:
         start = file.read(4)

@@ -1,8 +1,6 @@
 """Reads images and masks; writes PNG, OpenEXR and Radiance HDR images.
 
-Color is sRGB in [0, 1] as stored; alpha is straight (not premultiplied), and color where alpha is 0 is kept.  EXIF
-orientation is reported in a note but not applied, because calibrated cameras refer to the stored pixels, unless the
-image size in the camera file fits only the rotated image.
+Color is sRGB in [0, 1] as stored; alpha is straight (not premultiplied), and color where alpha is 0 is kept.
 """
 
 import io
@@ -91,8 +89,9 @@ def decode_image(
 
     Reads PNG, JPEG, WebP or TIFF: 8-bit color, palette, gray, CMYK, 16-bit gray; 16-bit color is reduced to 8 bits.
     The size is checked before decoding.  notes: receives changes of the pixels.  calibrated: width and height in the
-    camera file; the EXIF orientation is applied if only the rotated image has this aspect ratio.  upright: it is always
-    applied.  Raises InputError for other formats, more than 64 MP, several frames, or a broken file.
+    camera file; the EXIF orientation is applied if only the rotated image has this aspect ratio, otherwise noted, as
+    cameras refer to the stored pixels.  upright: it is always applied.  Raises InputError for other formats, more than
+    64 MP, several frames, or a broken file.
     """
     size = file_size(path)
     if size > MAX_BYTES:

@@ -1,9 +1,4 @@
-"""Reads a folder of posed photographs as :class:`~reli3d.views.views.Views`.
-
-Supported: ``transforms.json`` (object folders as published, Blender, nerfstudio, instant-ngp), NeRF-synthetic's
-``transforms_train.json``, a COLMAP model, LLFF's ``poses_bounds.npy`` and IDR's and NeuS's ``cameras_sphere.npz``.  The
-object is separated from the background by the images' alpha, by ``mask_path``, or by files in a folder ``masks``.
-"""
+"""Reads a folder of posed photographs as :class:`~reli3d.views.views.Views`."""
 
 import itertools
 import math
@@ -51,7 +46,8 @@ def load_views(
 ) -> Views:
     """Reads the images of an object folder with cameras and masks, in folder order.
 
-    folder: with ``transforms.json`` (or its splits), a COLMAP model, ``cameras_sphere.npz`` or ``poses_bounds.npy``.
+    folder: with ``transforms.json`` (or NeRF-synthetic's splits), a COLMAP model, LLFF's ``poses_bounds.npy``, or IDR's
+    and NeuS's ``cameras_sphere.npz``.
     views: number of views, 1 to 16, by farthest-point sampling, the default above 16.  every: all views;
     :meth:`Views.taken` selects later.  masks: folder; None: ``mask_path`` of a frame, alpha, or a folder ``masks`` or
     ``mask``.  whole: downsample images above two megapixels instead of cropping to the object.  remove_background:

@@ -1,8 +1,4 @@
-"""Posed images of one object with masks: the result of the readers and the input of the pipeline.
-
-Color is sRGB in [0, 1] with straight alpha, including the background.  Cameras are camera-to-world in OpenGL axes
-(+X right, +Y up, looking along -Z), intrinsics (fx, fy, cx, cy) in pixels with pixel centers at +0.5.
-"""
+"""Posed images of one object with masks: the result of the readers and the input of the pipeline."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -44,10 +40,11 @@ class ViewBatch(Movable):
 class Views(Movable):
     """``V`` posed images, which may have different sizes; view 0 is the reference view of the published network.
 
-    images: V tensors ``(H, W, 3)``, float32 sRGB in [0, 1].  masks: V tensors ``(H, W)``, float32 alpha in [0, 1].
-    c2w: ``(V, 4, 4)`` float32 rigid camera-to-world matrices, OpenGL axes.  intrinsics: ``(V, 4)`` as ``fx, fy, cx,
-    cy`` in pixels.  names: V file stems.  All on one device, without gradient.  Raises TypeError for a wrong dtype,
-    ValueError for shapes or devices that do not match.
+    images: V tensors ``(H, W, 3)``, float32 sRGB in [0, 1], with the background.  masks: V tensors ``(H, W)``, float32
+    straight alpha in [0, 1].  c2w: ``(V, 4, 4)`` float32 rigid camera-to-world matrices, OpenGL axes (+X right, +Y up,
+    looking along -Z).  intrinsics: ``(V, 4)`` as ``fx, fy, cx, cy`` in pixels, pixel centers at +0.5.  names: V file
+    stems.  All on one device, without gradient.  Raises TypeError for a wrong dtype, ValueError for shapes or devices
+    that do not match.
 
     >>> views = reli3d.load_views("photos/shoe")
     >>> size = [image.shape for image in views.images]
