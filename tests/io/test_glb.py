@@ -1,4 +1,4 @@
-"""GLB files judged from outside: the Khronos validator, trimesh and pygltflib, and hostile input.
+"""GLB files judged from outside: the Khronos validator, trimesh and pygltflib, and limits.
 
 The validator is npm's ``gltf-validator``: ``npm install gltf-validator`` in any folder outside the checkout, then set
 RELI3D_GLTF_VALIDATOR to its ``node_modules``.
