@@ -10,23 +10,21 @@ import torch
 import trimesh
 from PIL import Image
 
-from reli3d.geometry.uv import unwrap
 from reli3d.io.obj import obj_files
 from reli3d.io.usd import usdz_bytes
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb
-from tests.support.meshes import mesh_from
+from tests.support.scenes import ball_mesh
 
 SIZE = 64
 
 
 @pytest.fixture(scope="module")
 def asset() -> Asset:
-    mesh = mesh_from(trimesh.creation.icosphere(2))
     row, column = torch.meshgrid(torch.linspace(0, 1, SIZE), torch.linspace(0, 1, SIZE), indexing="ij")
     color = torch.stack([row, column, torch.full_like(row, 0.2)], -1)  # different at top and bottom
     flat = torch.tensor([0.5, 0.5, 1.0]).expand(SIZE, SIZE, 3).contiguous()
-    return Asset(unwrap(mesh, texture_size=SIZE).with_tangents(), TextureSet(color, row, column, flat))
+    return Asset(ball_mesh(2, 1.0), TextureSet(color, row, column, flat))
 
 
 def test_trimesh_reads_the_obj_back(asset, tmp_path):
