@@ -260,10 +260,9 @@ class Document:
         index = index.astype(np.int32)
         if mode == TRIANGLES:
             return index[: len(index) // 3 * 3].reshape(-1, 3)
-        count = max(len(index) - 2, 0)
-        k = np.arange(count)
+        k = np.arange(len(index) - 2)
         if mode == FAN:
-            return np.stack([index[k + 1], index[k + 2], np.broadcast_to(index[:1], count)], 1).astype(np.int32)
+            return np.stack([index[k + 1], index[k + 2], index[0 * k]], 1)
         return np.stack([index[k], index[k + 1 + k % 2], index[k + 2 - k % 2]], 1)
 
     def placed_meshes(self, origin: list[float] | None = None) -> list[Placed]:

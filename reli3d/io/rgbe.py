@@ -182,10 +182,8 @@ def _pack(out: bytearray, line: np.ndarray) -> None:
     for start, length in zip(starts[lengths >= 4].tolist(), lengths[lengths >= 4].tolist()):
         _literals(out, data[literal:start])
         literal = start + length
-        while length > 0:
-            part = min(length, 127)
-            out += bytes((128 + part, data[start]))
-            length -= part
+        for at in range(start, literal, 127):
+            out += bytes((128 + min(127, literal - at), data[at]))
     _literals(out, data[literal:])
 
 
