@@ -314,6 +314,15 @@ def test_omissions_are_noted_once(tmp_path):
     assert notes == [f"a.glb: {name} is left out" for name in left]
 
 
+@pytest.mark.parametrize(
+    "mode, indices, faces", [(5, [0, 1, 3, 2], [[0, 1, 3], [1, 2, 3]]), (6, [0, 1, 2, 3], [[1, 2, 0], [2, 3, 0]])]
+)
+def test_strips_and_fans_are_triangles(tmp_path, mode, indices, faces):
+    quad = Quad()
+    quad.primitive |= {"mode": mode, "indices": quad.accessor(np.uint16(indices))}
+    assert quad.read(tmp_path)[0].mesh.faces.tolist() == faces
+
+
 def test_hidden_nodes_are_not_read(tmp_path):
     quad = Quad()
     hidden = {"extensions": {"KHR_node_visibility": {"visible": False}}, "children": [2]}
