@@ -33,7 +33,7 @@ _MODULES = {
     "render.silhouette": ("antialias",),
     "io.glb": ("read_glb", "write_glb"),
     "io.hdr": ("read_environment", "write_environment"),
-    "io.images": ("write_image",),
+    "io.images": ("read_image", "write_image"),
 }
 _PUBLIC_MODULES = ("errors", "fit", "geometry", "io", "render")
 _HOME = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
