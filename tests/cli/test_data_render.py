@@ -14,6 +14,7 @@ import pytest
 from reli3d.cli import data, objects
 from reli3d.render.latlong import lat_long_directions
 from tests.support.checkout import ROOT
+from tests.support.stages import write_maps
 
 COUNT = 4
 SLOW = pytest.mark.slow  # a cluster of Ray takes half a minute to start
@@ -22,10 +23,8 @@ PLACES = [pytest.param(["--workers", "2"], id="processes"), pytest.param(["--ray
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory):
-    path = tmp_path_factory.mktemp("maps") / "maps.npz"
     sky = 0.2 + 3.0 * lat_long_directions(16)[..., :1].clamp(min=0).expand(-1, -1, 3).numpy()
-    np.savez(path, env=np.stack([sky * (1 + 0.2 * k) for k in range(6)]), names=[f"m{k}" for k in range(6)])
-    return path
+    return write_maps(tmp_path_factory.mktemp("maps"), np.stack([sky * (1 + 0.2 * k) for k in range(6)]))
 
 
 def call(maps: Path, out: Path, *options: str) -> list[str]:

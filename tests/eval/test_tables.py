@@ -15,6 +15,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions
 from tests.support import small_scene
 from tests.support.meshes import mesh_of
+from tests.support.stages import write_maps
 
 
 def sphere(radius, count=20_000, seed=0):
@@ -59,8 +60,7 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
     write_glb(folder / "ball.glb", replace(small_scene.ball(), environment=None))
     sky = (0.3 + lat_long_directions(64).clamp(min=0)).numpy()[None].repeat(12, 0)
-    names = [f"{k:02d}" for k in range(12)]
-    np.savez(folder / "maps.npz", env=sky * (1 + np.arange(12)[:, None, None, None] / 12), names=names)
+    write_maps(folder, sky * (1 + np.arange(12)[:, None, None, None] / 12))
     return folder
 
 

@@ -17,6 +17,7 @@ from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.samples import ObjectSurface, synthesize
 
 RADIUS, SEEDS = 0.5, (3, 12)
+WHITE = np.ones((6, 8, 16, 3), np.float32)  # six maps
 SMALL = replace(TINY, name="smaller", image_size=32, plane_size=4, resolution=16)
 
 
@@ -53,10 +54,17 @@ def numbers(run: Path) -> list[dict]:
     return [{k: v for k, v in row.items() if k != "seconds"} for row in rows(run) if "config" not in row]
 
 
-def rendered_sample(folder: Path, spec: SampleSpec, seed: int = 0) -> Path:
+def write_maps(folder: Path, maps: np.ndarray = WHITE) -> Path:
+    """``maps.npz`` of environment maps ``(n, H, 2H, 3)`` in ``folder``."""
+    np.savez(folder / "maps.npz", env=maps, names=[f"m{k:02d}" for k in range(len(maps))])
+    return folder / "maps.npz"
+
+
+def rendered_sample(folder: Path, maps: Path, *, views: int, size: int, meshes=(), shapes=(), seed: int = 0) -> Path:
     """A sample as ``reli3d-data render`` makes it, without the process of a worker."""
     threads, name = torch.get_num_threads(), f"{seed:010d}"
     folder.mkdir(exist_ok=True)
+    spec = SampleSpec(maps, held_out=False, paper=False, views=views, size=size, meshes=meshes, shapes=shapes)
     SampleJob(spec).run(None, name, folder / f"{name}.safetensors")
     torch.set_num_threads(threads)
     return folder / f"{name}.safetensors"

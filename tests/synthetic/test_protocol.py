@@ -18,18 +18,18 @@ from reli3d.train.stages.config import StageConfig
 from reli3d.train.stages.losses import gradients
 from reli3d.train.stages.step import object_losses
 from reli3d.train.stages.views import Samples, draw
-from tests.support.stages import ball_model
+from tests.support.stages import ball_model, write_maps
 
 SIGNIFICANCE = 0.01 / 8  # eight tests of distributions, 1 per cent for all together
 BOX = torch.as_tensor(trimesh.creation.box((1.0, 0.4, 0.15)).vertices, dtype=torch.float32)
 SWORD = torch.tensor([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.03, 0.4, 0.01], [-0.03, 0.4, -0.01]])
 
 
-def maps(count: int = 8) -> np.ndarray:
+def maps() -> np.ndarray:
     """Skies that are bright towards one side and differ from row to row."""
     sky = 0.2 + 3.0 * lat_long_directions(32)[..., :1].clamp(min=0).expand(-1, -1, 3)
     sky = sky + torch.linspace(0, 1, 32)[:, None, None]
-    return np.stack([sky.numpy() * (1.0 + 0.1 * k) + 0.05 * k for k in range(count)]).astype(np.float32)
+    return np.stack([sky.numpy() * (1.0 + 0.1 * k) + 0.05 * k for k in range(8)]).astype(np.float32)
 
 
 def degrees(cameras) -> np.ndarray:
@@ -113,10 +113,9 @@ def test_a_sample_is_a_function_of_seed_and_light_and_its_light_a_turned_map():
 def rendered(tmp_path_factory):
     """A folder of one GLB with two numbers for its material, and one procedural object, by the command."""
     root = tmp_path_factory.mktemp("protocol")
-    np.savez(root / "maps.npz", env=maps(), names=[f"m{k}" for k in range(8)])
     (root / "glb" / "deeper").mkdir(parents=True)
     trimesh.creation.box().export(root / "glb" / "deeper" / "box.glb")
-    call = ["--maps", str(root / "maps.npz"), "--size", "16", "--protocol", "paper", "--workers", "1"]
+    call = ["--maps", str(write_maps(root, maps())), "--size", "16", "--protocol", "paper", "--workers", "1"]
     assert data.main(["render", str(root / "rgb"), *call, "--meshes", str(root / "glb")]) == 0
     assert data.main(["render", str(root / "pbr"), *call, "--count", "1"]) == 0
     return root

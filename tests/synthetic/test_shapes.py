@@ -6,11 +6,10 @@ import torch
 import trimesh
 from safetensors.torch import load_file
 
-from reli3d.cli.samples import SampleSpec
 from reli3d.errors import InputError
 from reli3d.synthetic import shapes
 from reli3d.synthetic.shapes import ShapeSurface, combine, rounded
-from tests.support.stages import rendered_sample
+from tests.support.stages import rendered_sample, write_maps
 
 
 @pytest.fixture
@@ -53,7 +52,5 @@ def test_too_many_faces_are_refused(files, monkeypatch):
 
 
 def test_a_sample_of_shapes_knows_its_finish(files, tmp_path):
-    np.savez(tmp_path / "maps.npz", env=np.ones((6, 8, 16, 3), np.float32), names=[f"m{k}" for k in range(6)])
-    spec = SampleSpec(tmp_path / "maps.npz", False, False, views=2, size=32, meshes=(), shapes=files)
-    sample = load_file(rendered_sample(tmp_path / "out", spec))
+    sample = load_file(rendered_sample(tmp_path / "out", write_maps(tmp_path), views=2, size=32, shapes=files))
     assert sample["finish_known"].tolist() == [1, 1]

@@ -8,14 +8,13 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from reli3d.cli.data import main as data
-from reli3d.cli.samples import SampleSpec
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.presets import SMALL
 from reli3d.train.batches import load_sample
 from reli3d.train.losses import losses, pixel_losses
 from reli3d.train.pixels import Group, read_views_reduced
 from reli3d.train.stages.views import Samples
-from tests.support.stages import rendered_sample
+from tests.support.stages import rendered_sample, write_maps
 
 FINISH = {"roughness", "metallic"}
 
@@ -24,15 +23,14 @@ FINISH = {"roughness", "metallic"}
 def scans(tmp_path_factory):
     """Samples of one box without material maps: as it is, and with exchanged materials."""
     root = tmp_path_factory.mktemp("scans")
-    np.savez(root / "maps.npz", env=np.ones((6, 8, 16, 3), np.float32), names=[f"m{k}" for k in range(6)])
+    maps = write_maps(root)
     trimesh.creation.box().export(root / "box.glb")
     (root / "sets" / "one").mkdir(parents=True)
     for name in ("basecolor", "roughness", "metallic"):
         Image.new("RGB", (32, 32), (128, 128, 128)).save(root / "sets" / "one" / f"{name}.png")
-    call = ["--maps", str(root / "maps.npz"), "--meshes", str(root / "box.glb"), "--count", "1", "--views", "2"]
+    call = ["--maps", str(maps), "--meshes", str(root / "box.glb"), "--count", "1", "--views", "2"]
     call += ["--size", "32", "--workers", "1"]
-    spec = SampleSpec(root / "maps.npz", False, False, views=2, size=32, meshes=(root / "box.glb",), shapes=())
-    rendered_sample(root / "plain", spec)
+    rendered_sample(root / "plain", maps, views=2, size=32, meshes=(root / "box.glb",))
     assert data(["render", str(root / "refinished"), *call, "--materials", str(root / "sets")]) == 0
     return root
 

@@ -5,14 +5,13 @@ import pytest
 import torch
 import trimesh
 
-from reli3d.cli.samples import SampleSpec
 from reli3d.geometry.camera import project
 from reli3d.nn.weights import load_model
 from reli3d.train import batches
 from reli3d.train.batches import load_sample
 from reli3d.train.losses import losses
 from reli3d.train.mirror import mirrored_visibility, surface_mirror
-from tests.support.stages import rendered_sample
+from tests.support.stages import rendered_sample, write_maps
 
 ANGLE, OFFSET = 0.7, 0.13  # of the plane
 
@@ -59,10 +58,8 @@ def test_a_mirror_image_shows_what_the_mirrored_camera_sees():
 def box(tmp_path_factory):
     """Two views of a box."""
     root = tmp_path_factory.mktemp("box")
-    np.savez(root / "maps.npz", env=np.ones((6, 8, 16, 3), np.float32), names=[f"m{k}" for k in range(6)])
     trimesh.creation.box((1.0, 0.7, 0.4)).export(root / "box.glb")
-    spec = SampleSpec(root / "maps.npz", False, False, views=2, size=64, meshes=(root / "box.glb",), shapes=())
-    return rendered_sample(root / "out", spec)
+    return rendered_sample(root / "out", write_maps(root), views=2, size=64, meshes=(root / "box.glb",))
 
 
 def test_mirror_images_show_the_points_that_they_are_said_to_show(box, monkeypatch):
@@ -79,8 +76,8 @@ def test_mirror_images_show_the_points_that_they_are_said_to_show(box, monkeypat
         assert bool((s.visible[:, 2:] > 0).any())
 
 
-def test_mirror_images_reach_the_losses_and_the_gradient(box, monkeypatch):
-    model, found = load_model("small").train().requires_grad_(True), {}
+def test_mirror_images_reach_the_losses_and_leave_the_maps_of_the_views_as_they_are(box, monkeypatch):
+    model, found = load_model("small").train().requires_grad_(True), []
     for probability in (0.0, 1.0):
         monkeypatch.setattr(batches, "MIRROR_PROBABILITY", probability)
         sample = load_sample(box, 2, 512, np.random.default_rng(3))
@@ -88,18 +85,10 @@ def test_mirror_images_reach_the_losses_and_the_gradient(box, monkeypatch):
         terms = losses(model, sample)
         model.zero_grad()
         sum(terms.values()).backward()
-        found[probability] = terms, float(model.volume.out.weight.grad.norm())
-    (plain, gradient), (mirrored, other) = found[0.0], found[1.0]
-    assert plain.keys() == mirrored.keys() and 0.0 < gradient != other > 0.0
-    assert plain["occupancy"].item() != mirrored["occupancy"].item()
-
-
-def test_mirror_images_leave_the_maps_of_the_views_as_they_are(box, monkeypatch):
-    found = []
-    for probability in (0.0, 1.0):
-        monkeypatch.setattr(batches, "MIRROR_PROBABILITY", probability)
-        found.append(load_sample(box, 2, 512, np.random.default_rng(3)))
-    plain, mirrored = found
+        found.append((sample, terms, float(model.volume.out.weight.grad.norm())))
+    (plain, terms, gradient), (mirrored, other_terms, other) = found
+    assert terms.keys() == other_terms.keys() and 0.0 < gradient != other > 0.0
+    assert terms["occupancy"].item() != other_terms["occupancy"].item()
     assert len(mirrored.mirrored_c2w) == 2 and len(plain.mirrored_c2w) == 0
     for name in ("images", "masks", "view_material", "view_normal", "view_depth", "surface"):
         assert torch.equal(getattr(plain, name), getattr(mirrored, name)), name

@@ -8,7 +8,6 @@ import torch
 from torch.nn.functional import avg_pool2d, interpolate
 
 from reli3d.cli.data import main as data
-from reli3d.cli.samples import SampleSpec
 from reli3d.cli.train import main
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import hull_distance
@@ -22,7 +21,7 @@ from reli3d.train.loop import train
 from reli3d.train.losses import PIXEL_TERMS, losses, pixel_losses
 from reli3d.train.pixels import Group, draw_group, predict_pixels, read_views_reduced
 from reli3d.train.small import PixelStage
-from tests.support.stages import rendered_sample
+from tests.support.stages import rendered_sample, write_maps
 
 
 @pytest.fixture(scope="module")
@@ -185,12 +184,11 @@ def test_training_of_pixels_teaches_the_2d_u_net_alone(folder, tmp_path):
 
 def test_samples_of_views_alone_teach_the_2d_u_net_and_nothing_else(tmp_path, capsys):
     light = np.random.default_rng(0).random((6, 8, 16, 3), dtype=np.float32)
-    np.savez(tmp_path / "maps.npz", env=light, names=np.array([f"map{k}" for k in range(6)]))
-    expected = ["--maps", str(tmp_path / "maps.npz"), "--count", "2", "--views", "3", "--size", "64", "--workers", "1"]
+    maps = write_maps(tmp_path, light)
+    expected = ["--maps", str(maps), "--count", "2", "--views", "3", "--size", "64", "--workers", "1"]
     assert data(["render", str(tmp_path / "views"), "--views-only", *expected]) == 0
-    spec = SampleSpec(tmp_path / "maps.npz", False, False, views=3, size=64, meshes=(), shapes=())
     for seed in range(2):
-        path = rendered_sample(tmp_path / "whole", spec, seed)
+        path = rendered_sample(tmp_path / "whole", maps, views=3, size=64, seed=seed)
         views, whole = read_views_reduced(tmp_path / "views" / path.name, 1), read_views_reduced(path, 1)
         assert torch.equal(views.c2w, whole.c2w)
         both = views.view_valid & whole.view_valid

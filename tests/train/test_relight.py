@@ -15,6 +15,7 @@ from reli3d.synthetic.samples import synthesize
 from reli3d.train import batches
 from reli3d.train.relight import Finish, draw_flash, draw_light, relight_views
 from tests.support import reference
+from tests.support.stages import WHITE, write_maps
 from tests.support.surfaces import Ball
 
 
@@ -36,6 +37,19 @@ def sky():
 @pytest.fixture(scope="module")
 def sample(sky):
     return synthesize(Ball(finish, 5, 0.5), sky, np.random.default_rng(2), size=96, views=3)
+
+
+@pytest.fixture
+def drawn(sample, tmp_path, monkeypatch):
+    """Loads two views of the stored sample, with constants of ``batches`` replaced."""
+    save_file(sample, tmp_path / "0.safetensors")
+
+    def load(lights=None, **constants):
+        for name, value in constants.items():
+            monkeypatch.setattr(batches, name, value)
+        return batches.load_sample(tmp_path / "0.safetensors", 2, 64, np.random.default_rng(5), lights=lights)
+
+    return load
 
 
 def maps_of(sample):
@@ -89,19 +103,14 @@ def test_a_flash_lights_pixels_from_the_camera(sample, sky):
     assert ratio == pytest.approx(1.0, abs=0.01)  # the plain image is clipped in a few pixels
 
 
-def test_some_samples_are_relit_with_a_flash(sample, sky, tmp_path, monkeypatch):
+def test_some_samples_are_relit_with_a_flash(drawn, sky):
     ratios = np.array([draw_flash(np.random.default_rng(k)) for k in range(2000)])
     used = ratios[ratios > 0]
     assert 236 < len(used) < 364  # 0.15 of 2000, 4 standard deviations
     assert 0.5 <= used.min() < 0.6 and 7.0 < used.max() <= 8.0
-    save_file(sample, tmp_path / "0.safetensors")
-    monkeypatch.setattr(batches, "RELIGHT_PROBABILITY", 1.0)
-    images = []
-    for flash in (0.0, 4.0):
-        monkeypatch.setattr(batches, "draw_flash", lambda rng, flash=flash: flash)
-        drawn = batches.load_sample(tmp_path / "0.safetensors", 2, 64, np.random.default_rng(5), lights=sky[None])
-        images.append(drawn.images)
-    assert not torch.equal(*images)
+    flashes = (lambda rng: 0.0), (lambda rng: 4.0)
+    dark, flashed = (drawn(sky[None], RELIGHT_PROBABILITY=1.0, draw_flash=flash).images for flash in flashes)
+    assert not torch.equal(dark, flashed)
 
 
 def test_a_finish_is_the_same_for_pixels_and_points():
@@ -117,38 +126,26 @@ def test_a_finish_is_the_same_for_pixels_and_points():
     assert 34 < same < 86 and any(f.metallic == 1.0 for f in drawn)  # 0.3 of 200, 4 standard deviations
 
 
-def test_samples_are_relit_where_lights_are_given(sample, sky, tmp_path, monkeypatch):
-    save_file(sample, tmp_path / "0.safetensors")
-
-    def draw(probability, lights):
-        monkeypatch.setattr(batches, "RELIGHT_PROBABILITY", probability)
-        return batches.load_sample(tmp_path / "0.safetensors", 2, 64, np.random.default_rng(5), lights=lights)
-
+def test_samples_are_relit_where_lights_are_given(drawn, sky):
     lights = sky[None]
-    stored, never, always, again = draw(1.0, None), draw(0.0, lights), draw(1.0, lights), draw(1.0, lights)
-    assert torch.equal(stored.images, draw(0.0, None).images)  # without lights none are drawn
+    never, unlit = drawn(lights, RELIGHT_PROBABILITY=0.0), drawn()
+    stored, always, again = drawn(RELIGHT_PROBABILITY=1.0), drawn(lights), drawn(lights)
+    assert torch.equal(stored.images, unlit.images)  # without lights none are drawn
     assert float((never.view_depth - stored.view_depth).abs().max()) < 3.0  # another turn, the same object
     assert torch.equal(always.images, again.images) and torch.equal(always.light, again.light)
     assert not torch.equal(always.light, stored.light)
     assert all(bool(torch.isfinite(v.float()).all()) for v in vars(always).values())
 
 
-def test_a_tone_curve_is_one_exponent_of_all_pixels(sample, tmp_path, monkeypatch):
-    save_file(sample, tmp_path / "0.safetensors")
-    monkeypatch.setattr(batches, "MAX_NOISE", 0.0)
-    images = []
-    for probability in (0.0, 1.0):
-        monkeypatch.setattr(batches, "TONE_PROBABILITY", probability)
-        images.append(batches.load_sample(tmp_path / "0.safetensors", 2, 64, np.random.default_rng(5)).images)
-    plain, curved = images
+def test_a_tone_curve_is_one_exponent_of_all_pixels(drawn):
+    plain, curved = (drawn(MAX_NOISE=0.0, TONE_PROBABILITY=probability).images for probability in (0.0, 1.0))
     exponent = (curved.log() / plain.log())[(plain > 0.05) & (plain < 0.95)]
     assert abs(float(exponent.mean()) - 1.0) > 0.01 and float(exponent.std()) < 1e-4
 
 
 def test_lights_are_drawn_from_the_maps_that_training_may_see(tmp_path):
     maps = np.random.default_rng(0).random((12, 64, 128, 3)).astype(np.float32)
-    np.savez(tmp_path / "maps.npz", env=maps, names=[f"map{k:02d}" for k in range(12)])
-    lights = training_maps(tmp_path / "maps.npz")
+    lights = training_maps(write_maps(tmp_path, maps))
     assert len(lights) == 10 and torch.equal(lights[0], quarter_turn(torch.from_numpy(maps[0]), -1))
     drawn = draw_light(lights, np.random.default_rng(1))
     assert drawn.shape == (64, 128, 3) and float(drawn.min()) > 0
@@ -156,8 +153,7 @@ def test_lights_are_drawn_from_the_maps_that_training_may_see(tmp_path):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
 def test_a_map_whose_radiance_is_not_light_is_refused(value, tmp_path):
-    maps = np.ones((6, 8, 16, 3), np.float32)
+    maps = WHITE.copy()
     maps[2, 3, 4, 1] = value
-    np.savez(tmp_path / "maps.npz", env=maps, names=[f"m{k}" for k in range(6)])
-    with pytest.raises(InputError, match="env: expected finite radiance of at least 0, got others in m2"):
-        training_maps(tmp_path / "maps.npz")
+    with pytest.raises(InputError, match="env: expected finite radiance of at least 0, got others in m02"):
+        training_maps(write_maps(tmp_path, maps))
