@@ -35,7 +35,7 @@ def place(tmp_path, monkeypatch):
     for name, part in (("cut", whole[: len(whole) // 2]), ("nothing", b""), ("noise", b"\x07" * 4000)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "0000000003.safetensors").write_bytes(part)
-    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "summary.csv").mkdir(parents=True)
     (tmp_path / "example").symlink_to(infer.EXAMPLE)
     (tmp_path / "file").write_text("no maps")
     names = [str(k) for k in range(8)]
@@ -83,6 +83,7 @@ CASES = [
     *cases(infer, EXAMPLE, "--no-such-option, --device abacus, --views many", "arguments: "),
     *cases(infer, "input", "--output .", "mesh.glb would be replaced"),
     *cases(infer, "input empty --output out", "--masks empty", "--masks: expected one object"),
+    *cases(infer, "input good", "--output empty", "expected a file or none"),
     *cases(infer, "input/transforms.json", "--output out", "got a camera file; give input"),
     *cases(infer, ".", "--output ..", "expected a folder other than the working one"),
     *cases(data, f"{MAPS} maps.npz", "--workers 0, --first -5, --count 0, --views 0, --size 0"),

@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +27,13 @@ def colored(shape, size, color) -> Asset:
     mesh = unwrap(mesh_from(shape), texture_size=size).with_tangents()
     base_color = bake(mesh, size, lambda position, normal: color(position))["value"]
     return Asset(mesh, replace(textures(size, "cpu"), base_color=base_color))
+
+
+def exported(folder: Path, asset: Asset, *options: str) -> Asset:
+    """``asset`` stored as a GLB in ``folder``, and exported to another."""
+    write_glb(folder / "mesh.glb", asset)
+    assert main([str(folder / "mesh.glb"), *options, "--output", str(folder / "out")]) == 0
+    return read_glb(folder / "out" / "mesh.glb")[0]
 
 
 @pytest.fixture(scope="module")
@@ -95,9 +103,7 @@ def test_fewer_triangles_keep_the_relief_in_the_normal_map(tmp_path):
     ball.vertices *= 1.0 + 0.005 * np.sin(60.0 * ball.vertices[:, 1:2])
     mesh = unwrap(mesh_from(ball), texture_size=512)
     mesh = replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)).with_tangents()
-    write_glb(tmp_path / "mesh.glb", Asset(mesh, textures(512, "cpu", (0.5, 0.5, 0.5))))
-    assert main([str(tmp_path / "mesh.glb"), "--decimate", "2000", "--output", str(tmp_path / "out")]) == 0
-    (asset,) = read_glb(tmp_path / "out" / "mesh.glb")
+    asset = exported(tmp_path, Asset(mesh, textures(512, "cpu")), "--decimate", "2000")
     face = torch.arange(len(asset.mesh.faces), dtype=torch.int32)
     points = surface_points(asset.mesh, asset.textures, face, torch.full((len(face), 2), 1 / 3))
     y = torch.nn.functional.normalize(points.position, dim=1)[:, 1]
@@ -114,9 +120,7 @@ def test_smaller_textures_are_averages(tmp_path):
     mesh = unwrap(mesh_from(trimesh.creation.icosphere(2)), texture_size=512).with_tangents()
     gray = torch.rand(512, 512, 1, generator=torch.Generator().manual_seed(0)).expand(-1, -1, 3).contiguous()
     gray[~rasterize_texels(mesh, 512).valid] = 0.0  # unused texels do not bleed into the charts
-    write_glb(tmp_path / "mesh.glb", Asset(mesh, replace(textures(512, "cpu", (0.5, 0.5, 0.5)), base_color=gray)))
-    assert main([str(tmp_path / "mesh.glb"), "--texture-size", "128", "--output", str(tmp_path / "out")]) == 0
-    (asset,) = read_glb(tmp_path / "out" / "mesh.glb")
+    asset = exported(tmp_path, Asset(mesh, replace(textures(512, "cpu"), base_color=gray)), "--texture-size", "128")
     center = asset.mesh.uv[asset.mesh.faces.long()].mean(1)
     near = [(center * 128).long() + torch.tensor([a, b]) for a in (-1, 0, 1) for b in (-1, 0, 1)]
     values = torch.cat([asset.textures.base_color[k[:, 1], k[:, 0], 0] for k in near])

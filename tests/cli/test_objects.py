@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from reli3d.cli import infer, job, objects
+from reli3d.cli import infer, objects
 from reli3d.errors import InputError
 from tests.support.checkout import ROOT
 from tests.support.example import QUICK
@@ -36,12 +36,12 @@ def read_table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def rows(where: str, start: Start, items: list[objects.Item], count: int = 2):
+def rows(where: str, start: Start, items: list[objects.Item]):
     if where == "here":
         job = start()
         return [objects.make(job, item) for item in items]
     if where == "processes":
-        return list(objects.in_processes(start, items, count))
+        return list(objects.in_processes(start, items, 2))
     pytest.importorskip("ray")
     return list(objects.on_ray(start, items, "local"))
 
@@ -220,13 +220,6 @@ def test_a_list_names_folders(tmp_path):
     for name, word in (("empty", "got none"), ("bytes", "UTF-8"), ("missing", "not found"), (".", "regular file")):
         with pytest.raises(InputError, match=word):
             objects.listed(tmp_path / name)
-
-
-def test_a_folder_instead_of_the_summary_is_reported_at_once(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(job, "FolderJob", None)
-    (tmp_path / "summary.csv").mkdir()
-    assert infer.main(["a", "b", "--output", str(tmp_path)]) == 2
-    assert "expected a file or none" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from torch.nn import functional
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.nn.cost_volume import OFFSETS, CostVolume
 from reli3d.nn.pyramid import depth_of_origin
+from tests.support.differences import directional_derivatives
 
 SIDE, RADIUS, DISTANCE = 48, 0.4, 2.0
 
@@ -138,14 +139,10 @@ def test_gradients_reach_inputs_and_parameters(random_model):
         return (found(model, views, views["truth"]) - views["truth"]).square().sum()
 
     loss({**views, **inputs}).backward()
-    weight, step = model.match[2].weight, 1e-2
-    index = tuple(int(k) for k in torch.unravel_index(weight.grad.abs().argmax(), weight.shape))
-    values = []
-    with torch.no_grad():
-        for sign in (1.0, -2.0):
-            weight[index] += sign * step
-            values.append(float(loss(views)))
-    # a central difference of a float32 sum over some thousand pixels
-    assert float(weight.grad[index]) == pytest.approx((values[0] - values[1]) / (2 * step), rel=0.05)
+    weight = model.match[2].weight
+    direction = torch.zeros_like(weight)
+    direction.view(-1)[weight.grad.abs().argmax()] = 1.0
+    got, expected = directional_derivatives(lambda: loss(views), [weight], [direction], 1e-2)
+    assert got == pytest.approx(expected, rel=0.05)  # a central difference of a float32 sum over some thousand pixels
     without = {id(model.regular[4].bias), id(model.widening)}  # the bias shifts all scores
     assert all(t.grad.abs().sum() > 0 for t in (*inputs.values(), *model.parameters()) if id(t) not in without)

@@ -19,8 +19,6 @@ from tests.support.layers import LAYERS
 
 PACKAGE = ROOT / "reli3d"
 SOURCES = sorted(PACKAGE.rglob("*.py"))
-
-
 POSITION = {part: position for position, layer in enumerate(LAYERS) for part in layer}
 STARTERS = {"torch", "warp"}  # what ``import reli3d`` alone must not load
 
@@ -30,19 +28,19 @@ def part_of(module: str) -> str:
     return (module.split(".") + [""])[1]
 
 
-def name_of(path: Path, base: Path = ROOT) -> str:
-    parts = path.relative_to(base).with_suffix("").parts
+def name_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-MODULES = {name_of(path) for path in SOURCES}
+MODULES = {name_of(path) for part in ("reli3d", "tests", "bench") for path in (ROOT / part).rglob("*.py")}
 
 
 @functools.cache
 def imports(source: str, module: str, is_package: bool) -> list[str]:
     """Every module that ``source`` imports, at the top or inside functions, with relative names made absolute.
 
-    ``from a import b`` gives ``a.b`` where that is a module of the package, the module that defines ``b`` where ``a``
+    ``from a import b`` gives ``a.b`` where that is a module of the checkout, the module that defines ``b`` where ``a``
     is ``reli3d``, else ``a``.
     """
     found = []
@@ -110,14 +108,10 @@ def test_kernels_geometry_and_render_contain_no_constant_of_a_preset():
     assert len(found) > 50 and {name: bad for name, bad in found.items() if bad} == {}
 
 
-def of_other_tests(source: str, folder: str) -> list[str]:
+def of_other_tests(source: str, module: str) -> list[str]:
     """The imports of a file of ``tests`` from test modules, or one of ``bench`` from ``tests``."""
-    found = []
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, (ast.Import, ast.ImportFrom)):
-            base = (node.module or "").split(".") if isinstance(node, ast.ImportFrom) else []
-            found += [[*base, *alias.name.split(".")] for alias in node.names]
-    if folder == "bench":
+    found = [target.split(".") for target in imports(source, module, False)]
+    if module.startswith("bench."):
         return [".".join(parts) for parts in found if parts[0] == "tests"]
     return [".".join(parts) for parts in found if any(p == "conftest" or p.startswith("test_") for p in parts)]
 
@@ -125,7 +119,7 @@ def of_other_tests(source: str, folder: str) -> list[str]:
 @pytest.mark.parametrize("folder", ["tests", "bench"])
 def test_no_test_imports_another_and_bench_imports_no_test(folder):
     files = sorted((ROOT / folder).rglob("*.py"))
-    found = {name_of(path): of_other_tests(path.read_text(), folder) for path in files}
+    found = {name_of(path): of_other_tests(path.read_text(), name_of(path)) for path in files}
     assert len(found) > 20 and {name: bad for name, bad in found.items() if bad} == {}
 
 
