@@ -20,7 +20,7 @@ from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.latlong import lat_long_directions
 from reli3d.train import checkpoint, small
 from reli3d.train import losses as loss_terms
-from reli3d.train.batches import draw_samples, load_sample
+from reli3d.train.batches import draw_samples, load_sample, random_turn
 from reli3d.train.light_prior import LightPriorStage
 from reli3d.train.loop import parameter_groups, progress, rate_at, train
 from reli3d.train.losses import encode_sample, excess_entropy, losses, pattern_loss, perturbed
@@ -118,6 +118,14 @@ def test_the_excess_entropy_is_least_at_the_target_and_pulls_from_black_and_whit
     excess_entropy(logit.sigmoid(), torch.full((2, 3), 0.5)).backward()
     # the derivative of the cross-entropy by the logit is the difference of the colors, by the mean over 6 numbers
     torch.testing.assert_close(logit.grad, torch.tensor([-0.5, 0.5]).repeat(3, 1).T / 6, rtol=1e-3, atol=0)
+
+
+def test_turns_are_rotations():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        turn = random_turn(rng)
+        torch.testing.assert_close(turn @ turn.T, torch.eye(3), rtol=0, atol=1e-6)
+        assert float(torch.linalg.det(turn)) > 0
 
 
 def test_a_batch_is_a_function_of_seed_step_and_places_however_it_is_shared(folder):
