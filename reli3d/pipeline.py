@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -47,10 +47,7 @@ from reli3d.views.folder import load_views
 from reli3d.views.normalize import FAR_DISTANCES, normalize
 from reli3d.views.published_views import BACKGROUNDS, background_shown, hero_first, placement_notes
 from reli3d.views.similarity import Similarity, output_frame
-from reli3d.views.views import ViewBatch, Views, whole_views
-
-if TYPE_CHECKING:
-    from reli3d.fit.refine import Refinement
+from reli3d.views.views import Views, whole_views
 
 REFINED = 384  # pixels per side of the views that a refinement compares with
 LEAST_REFINED = 3  # views with the complete object from which a refinement leaves out the others
@@ -399,6 +396,7 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     >>> views = reli3d.load_views("photos/shoe", every=True)
     >>> asset = reli3d.refine(reli3d.reconstruct(views.taken()), views, seconds=60)
     """
+    from reli3d.fit import refine as fit  # imported where it is used: it loads kernels of its own
     from reli3d.fit.budget import Budget
 
     expect("asset", asset, Asset)
@@ -407,7 +405,7 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     options = {"light": views.lighting, **options}
     views, options["light"] = _complete_views(views, options["light"])
     batch = views.to(asset.mesh.vertices.device).resampled(REFINED, linear=True)
-    return _refined(asset, batch, seconds=seconds, steps=steps, **options).asset
+    return fit.refine(asset, batch, seconds=seconds, steps=steps, options=fit.RefineOptions(**options)).asset
 
 
 def _complete_views(views: Views, light: str | Sequence) -> tuple[Views, str | Sequence]:
@@ -416,14 +414,6 @@ def _complete_views(views: Views, light: str | Sequence) -> tuple[Views, str | S
     if not isinstance(light, str) and len(light) == len(views):
         light = [light[i] for i in chosen]
     return views.select(chosen), light
-
-
-def _refined(asset: Asset, batch: ViewBatch, *, seconds: float | None = None, steps: int | None = None,
-             bar: bool = False, interrupt: Callable[[], bool] | None = None, **options) -> Refinement:  # fmt: skip
-    from reli3d.fit import refine as fit  # imported where it is used: it loads kernels of its own
-
-    chosen = fit.RefineOptions(**options)
-    return fit.refine(asset, batch, seconds=seconds, steps=steps, options=chosen, bar=bar, interrupt=interrupt)
 
 
 class Progress:
@@ -500,7 +490,6 @@ def reconstruct_folder(
         whole = published_input(model.preset) or (_reads_background(model) and options.background != "masked")
         photographs = reading.read(folder, whole=whole)
         views, batch = photographs.taken(), None
-        fit: dict[str, Any] = {}
         if reading.budget:
             complete, light = _complete_views(photographs, reading.lighting(photographs))
             if left_out := len(photographs) - len(complete):
@@ -508,7 +497,6 @@ def reconstruct_folder(
                 views = replace(views, notes=(*views.notes, note))
             batch, names = complete.resampled(REFINED, linear=True), complete.names
             del complete
-            fit = {"light": light, "cameras": reading.cameras, **reading.budget}
         del photographs  # 1 GB of 60 images of 1 MP
     if options.up == "y" and (axis := up_axis(views.c2w)) not in (None, "y"):
         views = replace(views, notes=(*views.notes, f"the cameras suggest {axis} as the up axis: try --up {axis}"))
@@ -524,12 +512,16 @@ def reconstruct_folder(
     shown, compared, first, record = views.transformed(output), None, None, {}
     if batch is not None:
         with watch.stage("refine"):
+            from reli3d.fit import refine as fit
+
             batch = replace(batch, c2w=output.of_cameras(batch.c2w)).to(model.device)
-            result = _refined(asset, batch, bar=True, interrupt=reading.interrupt, **fit)
+            chosen = fit.RefineOptions(light=light, cameras=reading.cameras)
+            budget: dict[str, Any] = dict(reading.budget or {})
+            result = fit.refine(asset, batch, options=chosen, bar=True, interrupt=reading.interrupt, **budget)
             compared = comparison(asset, result.asset, shown.to(model.device))
         progress.report(result.notes)
         first, asset = asset if result.changed else None, result.asset
-        fitted = {"views": len(batch), "view_names": list(names), **(reading.budget or {})}
+        fitted = {"views": len(batch), "view_names": list(names), **budget}
         record = {"refinement": fitted | result.record()}
     with watch.stage("preview"):
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)

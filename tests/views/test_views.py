@@ -134,13 +134,13 @@ def test_cut_off_views_are_left_out_of_a_refinement_while_three_remain(monkeypat
     cut_off = (torch.ones_like(views.masks[0]), *views.masks[1:])
     fitted = []
     monkeypatch.setattr(
-        "reli3d.pipeline._refined", lambda asset, batch, **given: fitted.append((batch, given)) or asset
+        "reli3d.fit.refine.refine", lambda asset, batch, options, **_: fitted.append((batch, options)) or asset
     )
     asset = small_scene.ball()
     monkeypatch.setattr(Asset, "asset", None, raising=False)  # of the result
     refine(asset, replace(views, masks=cut_off), steps=1, light=list(range(9)))
     refine(asset, replace(views, masks=cut_off).select(3), steps=1)  # two others
-    assert [len(batch) for batch, _ in fitted] == [8, 3] and fitted[0][1]["light"] == list(range(1, 9))
+    assert [len(batch) for batch, _ in fitted] == [8, 3] and fitted[0][1].light == list(range(1, 9))
     assert torch.equal(fitted[0][0].c2w, views.c2w[1:]) and torch.equal(fitted[1][0].c2w, views.c2w[:3])
 
 
