@@ -11,8 +11,8 @@ from reli3d.render.environment import Environment
 from reli3d.render.transfer import spherical_harmonics
 
 
-def normals(n: int, seed: int = 0) -> torch.Tensor:
-    return normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)), dim=-1)
+def normals(n: int) -> torch.Tensor:
+    return normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
 
 
 def test_the_polynomials_span_the_spherical_harmonics():

@@ -1,6 +1,7 @@
 """``viewer.html`` in headless Chromium, opened as a file: its images against those of our renderer."""
 
 import base64
+import io
 import json
 import math
 import re
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from reli3d.cli import infer
 from reli3d.geometry.camera import Camera, look_at
@@ -25,11 +27,12 @@ from reli3d.render.image import Render, render_asset
 from reli3d.render.lights import sky, studio
 from reli3d.render.transfer import spherical_harmonics
 from reli3d.views.views import Views
-from tests.support.browser import chromium, pixels
+from tests.support.browser import chromium, pixels, show
 from tests.support.example import QUICK
 from tests.support.scenes import ball_mesh, textures
 
 SIZE, WIDE = 192, 336  # the page's window is wider than the photographs
+READY = "document.body.dataset.ready"
 EYES = ((0.9, 0.6, 2.0), (-2.0, 0.5, -0.6))
 # Minimum PSNR of each lighting.  On a ball, which has no self-occlusion, the limit is three.js' light prefiltered by
 # roughness, whose lobes are narrower than GGX: a ball half of rough metal reaches 24.9.
@@ -118,7 +121,7 @@ def one_page(asset: Asset, views: Views, light: Environment | None = None, meshe
 
 def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, tab, asset, views):
     (tmp_path / "viewer.html").write_text(one_page(asset, views, meshes=("before", "after")))
-    tab.open((tmp_path / "viewer.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
+    show(tab, (tmp_path / "viewer.html").as_uri(), size=(WIDE, SIZE), ready=READY)
 
     def rendered(**values) -> np.ndarray:
         return pixels(tab.evaluate(choose(**values) + "imageURL()"))
@@ -140,7 +143,7 @@ def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, tab, asset, vie
     still = psnr(rendered(turn=0), shown(turned, 0.5), turned.alpha)
     behind = rendered(behind=True)
     tab.evaluate(choose(blend=1.0))
-    covered = tab.screenshot()
+    covered = np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"))
     tab.evaluate("leave()")
     free = tab.evaluate("photograph.hidden")
     title, choices = tab.evaluate("document.title"), tab.evaluate("get('mesh').parentElement.hidden")
@@ -160,7 +163,7 @@ def test_the_page_shows_self_occlusion(tmp_path, tab, waisted, views):
     """In each light, turned and brightened: nearer to our renderer than without, and near."""
     (tmp_path / "viewer.html").write_text(one_page(waisted, views, studio()))
     found = {}
-    tab.open((tmp_path / "viewer.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
+    show(tab, (tmp_path / "viewer.html").as_uri(), size=(WIDE, SIZE), ready=READY)
     for i, (name, turn, stops, light) in enumerate((("estimated light", 30, 0, studio()), ("sky", -60, -1, sky()))):
         code = f"take({i}); " + choose(light=name, turn=turn, stopsof=stops) + "imageURL()"
         rendering, turned = pixels(tab.evaluate(code)), light.rotated(math.radians(turn))
@@ -193,7 +196,7 @@ def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, tab, asset, views, mo
             viewer, "blocked_transfer", lambda m, scene, h=hidden: h * cosine * spherical_harmonics(m.normals)
         )
         (tmp_path / f"{stops}.html").write_text(one_page(asset, views, sky()))
-        tab.open((tmp_path / f"{stops}.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
+        show(tab, (tmp_path / f"{stops}.html").as_uri(), size=(WIDE, SIZE), ready=READY)
         images.append(pixels(tab.evaluate("take(0); " + choose(turn=40, stopsof=stops) + "imageURL()")).astype(int))
     assert tab.problems == []
     assert np.abs(images[0] - images[1]).max() <= 4  # of 255: coefficients have 8 bits
@@ -204,7 +207,7 @@ def test_the_page_of_the_example_looks_as_its_image_by_the_renderer(tmp_path, ta
     assert infer.main(["--output", str(tmp_path), *QUICK]) == 0
     (part,) = read_glb(tmp_path / "example" / "mesh.glb")
     light = read_environment(tmp_path / "example" / "environment.exr")
-    tab.open((tmp_path / "example" / "viewer.html").as_uri(), size=(SIZE, SIZE)).wait("document.body.dataset.ready")
+    show(tab, (tmp_path / "example" / "viewer.html").as_uri(), size=(SIZE, SIZE), ready=READY)
     (view, *_) = tab.evaluate("data.views")
     rendering = pixels(tab.evaluate("take(0); imageURL()"))
     assert tab.problems == []

@@ -22,12 +22,12 @@ NOT_RUN = "<!-- not run:"  # on a line of its own before a block
 FILE = re.compile(r"# ([\w/]+\.py)\n")  # first line of a block that is a file of the repository
 
 
-def blocks(page: Path, language: str = "python") -> list[str]:
-    """Code of the fenced blocks of a page, each moved down to its line in the page."""
+def blocks(page: Path) -> list[str]:
+    """Code of the fenced Python blocks of a page, each moved down to its line in the page."""
     text, found = page.read_text(), []
-    for block in re.finditer(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+    for block in re.finditer(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         above = text[: block.start(1)]
-        if NOT_RUN not in above.rstrip().removesuffix(f"```{language}").rstrip().rpartition("\n")[2]:
+        if NOT_RUN not in above.rstrip().removesuffix("```python").rstrip().rpartition("\n")[2]:
             found.append("\n" * above.count("\n") + block.group(1))
     return found
 

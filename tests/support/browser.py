@@ -1,4 +1,4 @@
-"""Headless Chromium by Playwright: opens pages, evaluates JavaScript and captures images.
+"""Headless Chromium by Playwright, and the images of its pages.
 
 Chromium is ``RELI3D_CHROMIUM`` or the first of chromium, chromium-browser and google-chrome on the path.  WebGL is
 drawn by its software renderer, so no GPU is needed.
@@ -32,38 +32,11 @@ def find_chromium() -> str:
     return found
 
 
-class Page:
-    """One page; ``problems`` gathers errors and warnings of its console, and exceptions."""
-
-    def __init__(self, page):
-        self._page = page
-        self.problems: list[str] = []
-        page.set_default_timeout(1000 * TIMEOUT)
-        page.on("pageerror", lambda error: self.problems.append(str(error)))
-        page.on("console", self._note)
-
-    def open(self, url: str, *, size: tuple[int, int] = (512, 512)) -> "Page":
-        """Go to ``url`` with a window of ``size`` pixels; returns once the document is there."""
-        self._page.set_viewport_size({"width": size[0], "height": size[1]})
-        self._page.goto(url)
-        return self
-
-    def evaluate(self, code: str):
-        """Value of the JavaScript ``code``; a promise is awaited.  Its exception fails the test."""
-        return self._page.evaluate(code)
-
-    def wait(self, code: str) -> None:
-        """Return once ``code`` is true."""
-        self._page.wait_for_function(code, polling=100)
-
-    def screenshot(self) -> np.ndarray:
-        """The window's image, ``(H, W, 3)`` uint8."""
-        return np.asarray(Image.open(io.BytesIO(self._page.screenshot())).convert("RGB"))
-
-    def _note(self, message) -> None:
-        quiet = "GL Driver Message (OpenGL, Performance"  # reading an image back waits for the software renderer
-        if message.type in ("error", "warning", "assert") and quiet not in message.text:
-            self.problems.append(f"{message.text} {message.location['url']}")
+def show(page, url: str, *, size: tuple[int, int], ready: str) -> None:
+    """Go to ``url`` with a window of ``size`` pixels; returns once the JavaScript ``ready`` is true."""
+    page.set_viewport_size({"width": size[0], "height": size[1]})
+    page.goto(url)
+    page.wait_for_function(ready, polling=100)
 
 
 def pixels(data: str) -> np.ndarray:
@@ -72,17 +45,31 @@ def pixels(data: str) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def chromium() -> Iterator[Page]:
-    """A page of a fresh browser, which ends with the block."""
+def chromium() -> Iterator:
+    """Playwright's page of a fresh browser, which ends with the block.
+
+    ``problems`` of the page gathers errors and warnings of its console, and exceptions.
+    """
     from playwright.sync_api import sync_playwright
 
     program = find_chromium()
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=list(FLAGS))
         try:
-            yield Page(browser.new_page())
+            page = browser.new_page()
+            page.set_default_timeout(1000 * TIMEOUT)
+            page.problems = []
+            page.on("pageerror", lambda error: page.problems.append(str(error)))
+            page.on("console", lambda message: page.problems.extend(_problems(message)))
+            yield page
         finally:
             browser.close()
+
+
+def _problems(message) -> list[str]:
+    quiet = "GL Driver Message (OpenGL, Performance"  # reading an image back waits for the software renderer
+    wrong = message.type in ("error", "warning", "assert") and quiet not in message.text
+    return [f"{message.text} {message.location['url']}"] if wrong else []
 
 
 @contextlib.contextmanager

@@ -25,7 +25,7 @@ from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.image import render_asset
 from reli3d.render.shading import ShadeOptions
-from tests.support.browser import chromium, pixels, served
+from tests.support.browser import chromium, pixels, served, show
 
 THREE = Path(reli3d.__file__).parent / "assets" / "viewer" / "three.min.js"
 
@@ -94,7 +94,7 @@ def _shown(folder: Path, page: str, viewpoint: Viewpoint) -> np.ndarray:
     }
     (folder / "index.html").write_text(page % values)
     with chromium() as tab, served(folder) as url:
-        tab.open(f"{url}/index.html", size=(viewpoint.size, viewpoint.size)).wait("window.rendering")
+        show(tab, f"{url}/index.html", size=(viewpoint.size, viewpoint.size), ready="window.rendering")
         return pixels(tab.evaluate("window.rendering")).astype(np.float64)
 
 

@@ -18,10 +18,10 @@ from PIL import Image
 SIDE = 32
 
 
-def pose(yaw: float, distance: float = 2.0) -> list[list[float]]:
+def pose(yaw: float) -> list[list[float]]:
     """Camera-to-world of a camera on the horizon that looks at the origin."""
     c, s = math.cos(yaw), math.sin(yaw)
-    return [[c, 0.0, s, distance * s], [0.0, 1.0, 0.0, 0.0], [-s, 0.0, c, distance * c], [0.0, 0.0, 0.0, 1.0]]
+    return [[c, 0.0, s, 2.0 * s], [0.0, 1.0, 0.0, 0.0], [-s, 0.0, c, 2.0 * c], [0.0, 0.0, 0.0, 1.0]]
 
 
 def random_image(side: int = SIDE, alpha: bool = True) -> np.ndarray:
@@ -103,7 +103,7 @@ def _image(data: bytes | Callable[[], bytes]) -> Callable[[Path], None]:
     return _with(lambda folder: (folder / "rgba/0.png").write_bytes(data if isinstance(data, bytes) else data()))
 
 
-def _saved(pixels: np.ndarray, form: str = "PNG", **options) -> bytes:
+def saved(pixels: np.ndarray, form: str = "PNG", **options) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, form, **options)
     return buffer.getvalue()
@@ -113,18 +113,17 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def png_claiming(width: int, height: int, depth: int = 8, color: int = 6) -> bytes:
+def png_claiming(width: int, height: int) -> bytes:
     """A PNG of a few bytes that claims this size."""
-    header = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
     data = _chunk(b"IDAT", zlib.compress(bytes(100)))
     return b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", header) + data + _chunk(b"IEND", b"")
 
 
 def _animated() -> bytes:
-    buffer = io.BytesIO()
-    frames = [Image.fromarray(np.roll(random_image(), k, 0)) for k in range(3)]
-    frames[0].save(buffer, "WEBP", save_all=True, append_images=frames[1:], lossless=True)
-    return buffer.getvalue()
+    frames = [np.roll(random_image(), k, 0) for k in range(3)]
+    others = [Image.fromarray(frame) for frame in frames[1:]]
+    return saved(frames[0], "WEBP", save_all=True, append_images=others, lossless=True)
 
 
 def _link(target: str, name: str = "rgba/0.png") -> Callable[[Path], None]:
@@ -287,26 +286,26 @@ def cases() -> list[tuple[str, Callable[[Path], None]]]:
         # images
         ("image_empty", _image(b"")),
         ("image_text", _image(b"not an image at all")),
-        ("image_truncated", _image(lambda: _saved(noise)[:700])),
-        ("image_bad_checksum", _image(lambda: _saved(noise).replace(b"IDAT", b"IDAT\0", 1))),
+        ("image_truncated", _image(lambda: saved(noise)[:700])),
+        ("image_bad_checksum", _image(lambda: saved(noise).replace(b"IDAT", b"IDAT\0", 1))),
         ("image_bomb", _image(png_claiming(30_000, 30_000))),
         ("image_bomb_max", _image(png_claiming(2**31 - 1, 2**31 - 1))),
         ("image_claims_more", _image(png_claiming(4000, 4000))),
         ("image_zero_width", _image(png_claiming(0, 32))),
-        ("image_too_small", _image(lambda: _saved(full[:4, :4]))),
-        ("image_gif", _image(lambda: _saved(full[..., 0], "GIF"))),
-        ("image_bmp", _image(lambda: _saved(full[..., :3], "BMP"))),
+        ("image_too_small", _image(lambda: saved(full[:4, :4]))),
+        ("image_gif", _image(lambda: saved(full[..., 0], "GIF"))),
+        ("image_bmp", _image(lambda: saved(full[..., :3], "BMP"))),
         ("image_eps", _image(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 32\n")),
         ("image_svg", _image(b'<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>')),
         ("image_animated", _image(_animated)),
-        ("image_float", _image(lambda: _saved(np.full((SIDE, SIDE), 0.5, np.float32), "TIFF"))),
-        ("image_32_bit", _image(lambda: _saved(np.full((SIDE, SIDE), 1 << 30, np.int32), "TIFF"))),
+        ("image_float", _image(lambda: saved(np.full((SIDE, SIDE), 0.5, np.float32), "TIFF"))),
+        ("image_32_bit", _image(lambda: saved(np.full((SIDE, SIDE), 1 << 30, np.int32), "TIFF"))),
         ("image_broken_tiff", _image(b"II*\0" + b"\xff" * 60)),
         ("image_broken_webp", _image(b"RIFF\x40\0\0\0WEBPVP8L" + b"\xff" * 60)),
         ("image_broken_jpeg", _image(b"\xff\xd8\xff\xe0" + b"\xff" * 60)),
-        ("image_no_alpha", _image(lambda: _saved(full[..., :3]))),
-        ("image_opaque", _image(lambda: _saved(full))),
-        ("image_transparent", _image(lambda: _saved(full * np.array([1, 1, 1, 0], np.uint8)))),
+        ("image_no_alpha", _image(lambda: saved(full[..., :3]))),
+        ("image_opaque", _image(lambda: saved(full))),
+        ("image_transparent", _image(lambda: saved(full * np.array([1, 1, 1, 0], np.uint8)))),
         # masks
         ("mask_missing", _mask(None)),
         ("mask_black", _mask(np.zeros((SIDE, SIDE), np.uint8))),

@@ -8,7 +8,6 @@ from random import Random
 
 import numpy as np
 import torch
-from PIL import Image
 from safetensors.torch import save
 
 from reli3d.cli.objects import listed
@@ -43,9 +42,7 @@ def _folder(make: Callable[[Path], object], root: Path) -> dict[str, bytes]:
 
 
 def _encoded(form: str, **options) -> bytes:
-    data = io.BytesIO()
-    Image.fromarray(hostile.random_image(alpha=form != "JPEG")).save(data, form, **options)
-    return data.getvalue()
+    return hostile.saved(hostile.random_image(alpha=form != "JPEG"), form, **options)
 
 
 def _weights() -> bytes:

@@ -19,12 +19,11 @@ def eyes_around(count: int, distance: float = 2.2) -> torch.Tensor:
     return distance * torch.stack([r * torch.sin(phi), z, r * torch.cos(phi)], -1)
 
 
-def sphere_views(spheres=SPHERES, count=4, *, distance=2.2, size=(120, 96), fov=0.7, target=(0.0, 0.0, 0.0), eyes=None):
-    """Views of ``size`` (width, height) of spheres ``(x, y, z, radius)`` with cameras about ``target``."""
+def sphere_views(spheres=SPHERES, count=4, *, distance=2.2, size=(120, 96), fov=0.7, eyes=None):
+    """Views of ``size`` (width, height) of spheres ``(x, y, z, radius)`` with cameras about the origin."""
     width, height = size
-    target = torch.tensor(target, dtype=torch.float64)
-    eyes = (eyes_around(count, distance) if eyes is None else torch.as_tensor(eyes, dtype=torch.float64)) + target
-    c2w = look_at(eyes.float(), target.float().expand_as(eyes), torch.tensor([0.05, 1.0, 0.02]).expand(len(eyes), 3))
+    eyes = (eyes_around(count, distance) if eyes is None else torch.as_tensor(eyes)).float()
+    c2w = look_at(eyes, torch.zeros_like(eyes), torch.tensor([0.05, 1.0, 0.02]).expand(len(eyes), 3))
     focal = 0.5 * width / math.tan(0.5 * fov)
     intrinsics = torch.tensor([focal, focal, 0.5 * width + 3, 0.5 * height - 2]).expand(len(eyes), 4).contiguous()
     origins, directions = camera_rays(Camera(c2w, intrinsics, width, height))

@@ -26,14 +26,6 @@ def textures(size, device, color=(0.5, 0.5, 0.5), roughness=0.5, metallic=0.0, n
     return TextureSet(color, roughness, metallic, normal)
 
 
-def ball(device, color=(0.7, 0.7, 0.7)):
-    """An asset of one finish; its texture coordinates are random."""
-    mesh = mesh_from(trimesh.creation.icosphere(subdivisions=3, radius=0.6), device)
-    uv = torch.rand(len(mesh.vertices), 2, generator=torch.Generator().manual_seed(0)).to(device)
-    normals = torch.nn.functional.normalize(mesh.vertices, dim=-1)
-    return Asset(replace(mesh, normals=normals, uv=uv), textures(4, device, color))
-
-
 def ball_mesh(subdivisions: int, radius: float) -> Mesh:
     """A ball with smooth normals, tangents, and its view from +Z as texture coordinates."""
     mesh = mesh_from(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius))
@@ -43,16 +35,21 @@ def ball_mesh(subdivisions: int, radius: float) -> Mesh:
     return replace(mesh, normals=n, uv=(0.5 + 0.45 * n[:, :2]).contiguous(), tangents=tangents)
 
 
+def ball(device, color=(0.7, 0.7, 0.7)):
+    """An asset of one finish."""
+    return Asset(ball_mesh(3, 0.6), textures(4, "cpu", color)).to(device)
+
+
 def shadow_caster(device, backend="auto"):
     """A ball above the unit ball's points: it hides part of the sky."""
     shape = trimesh.creation.icosphere(subdivisions=3, radius=0.4).apply_translation([0, 1.2, 0])
     return RayScene(mesh_from(shape, device), backend=backend)
 
 
-def sky(height=16, seed=0, power=3.0):
-    """A map of random texels up to 2; the greater ``power``, the fewer are bright."""
+def sky(height=16, seed=0):
+    """A map of random texels up to 2, few of them bright."""
     g = torch.Generator().manual_seed(seed)
-    return Environment(torch.rand(height, 2 * height, 3, generator=g) ** power * 2.0)
+    return Environment(torch.rand(height, 2 * height, 3, generator=g) ** 3.0 * 2.0)
 
 
 def light(name, device):

@@ -18,7 +18,7 @@ from reli3d.train.stages.step import object_losses, total
 from reli3d.train.stages.surface import render_surface, surface
 from reli3d.train.stages.views import Samples, draw
 from tests.support.differences import directional_derivatives
-from tests.support.stages import ball_model, camera, write_samples
+from tests.support.stages import ball_model, camera, flatten, write_samples
 
 VOLUME = StageConfig("volume", "volume", 24, lobes=16, grid=8, samples_along=32)
 GAUSSIANS = StageConfig("gaussians", "gaussians", 24, lobes=16)
@@ -58,9 +58,9 @@ def one(tmp_path_factory):
 def test_the_whole_loss_has_the_gradient_of_central_differences(case, one, monkeypatch):
     stage, names, size, tolerance = CASES[case]
     model = ball_model()
-    for head in ("heads.normal", *(MATERIAL if names is SHAPE else ())):
+    flatten(model)
+    for head in MATERIAL if names is SHAPE else ():
         model.heads[head.removeprefix("heads.")][-1].weight.data.zero_()
-    model.heads["normal"][-1].bias.data.zero_()
     if names is SHAPE:
         grid = stage_step.occupied  # the choice of cells is not differentiated
         full = []
@@ -90,8 +90,7 @@ def test_all_terms_are_in_the_gradient(one):
 def test_the_normals_of_the_mesh_have_a_gradient_in_the_image(one):
     """The shading normal of a flat bump is that of the mesh; so is its shading."""
     model = ball_model()
-    model.heads["normal"][-1].weight.data.zero_()
-    model.heads["normal"][-1].bias.data.zero_()
+    flatten(model)
     code = stage_step.encode(model, one)
     with torch.no_grad():
         found = surface(model, code, 16)

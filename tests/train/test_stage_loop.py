@@ -34,8 +34,8 @@ def folder(small_samples):
     return small_samples
 
 
-def stage_of(folder, model=None, config=GAUSSIANS, **options):
-    return PaperStage(model or ball_model(), config, [Samples(folder)], folders=[str(folder)], **options)
+def stage_of(folder, model=None, **options):
+    return PaperStage(model or ball_model(), GAUSSIANS, [Samples(folder)], folders=[str(folder)], **options)
 
 
 def options_of(stage, out, **changes):

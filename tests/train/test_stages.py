@@ -17,7 +17,7 @@ from reli3d.train.stages.step import encode, object_losses, renderings, total
 from reli3d.train.stages.surface import render_surface, surface
 from reli3d.train.stages.views import Samples, draw
 from reli3d.train.stages.volume import occupied, render_volume
-from tests.support.stages import RADIUS, ball_model, camera
+from tests.support.stages import RADIUS, ball_model, camera, flatten
 
 VOLUME = StageConfig("volume", "volume", 24, patch=16, lobes=32, grid=8, samples_along=48)
 GAUSSIANS = StageConfig("gaussians", "gaussians", 24, lobes=32)
@@ -93,9 +93,8 @@ def test_even_lobes_keep_constant_light_and_the_total():
 def test_a_ball_is_shown_as_a_ball(stage, one):
     """Against the ball itself: opacity by quadrature, or its disc; normals; materials."""
     model, view = ball_model(), camera(48)
-    for name in ("normal", "density"):
-        model.heads[name][-1].weight.data.zero_()
-    model.heads["normal"][-1].bias.data.zero_()
+    flatten(model)
+    model.heads["density"][-1].weight.data.zero_()
     model.steep = 30.0 if stage is VOLUME else 12.0
     code = encode(model, one)
     origins, directions = camera_rays(view)
