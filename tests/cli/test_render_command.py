@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from reli3d.cli.render import main
-from reli3d.geometry.camera import Camera, camera_rays, look_at
+from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.io.glb import read_glb, write_glb
 from reli3d.io.hdr import read_environment, read_hdr_image, write_environment
 from reli3d.render.asset import Asset
@@ -21,6 +21,7 @@ from reli3d.render.color import agx, linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.image import render_asset
 from reli3d.render.shading import ShadeOptions
+from tests.support.rigs import rig
 from tests.support.scenes import ball_mesh, textures
 
 SIZE, DISTANCE = 24, 2.6
@@ -54,9 +55,7 @@ def expected(folder, *, azimuth=30.0, yaw=0.0, seed=0, **options):
     """The expected view: the eye is ``azimuth`` degrees from +Z towards +X and 20 above the horizon."""
     parts = read_glb(folder / "ball.glb")
     low, high = parts[0].mesh.vertices.amin(0), parts[0].mesh.vertices.amax(0)
-    a, lift = math.radians(azimuth), math.radians(20.0)
-    away = torch.tensor([math.cos(lift) * math.sin(a), math.sin(lift), math.cos(lift) * math.cos(a)])
-    pose = look_at((low + high) / 2 + DISTANCE * away, (low + high) / 2, torch.tensor([0.0, 1.0, 0.0]))
+    pose = rig((azimuth, 20.0, DISTANCE), target=((low + high) / 2).tolist())[0]
     camera = Camera.from_fov(pose, math.radians(32.0), SIZE, SIZE)
     light = read_environment(folder / "half.hdr").rotated(yaw)
     return render_asset(parts, camera, light, options=ShadeOptions(seed=seed), **options), camera, light

@@ -8,6 +8,7 @@ from torch.nn import functional
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.nn.cost_volume import OFFSETS, CostVolume
 from reli3d.nn.pyramid import depth_of_origin
+from reli3d.synthetic.procedural import yaw_matrix
 from tests.support.differences import directional_derivatives
 
 SIDE, RADIUS, DISTANCE = 48, 0.4, 2.0
@@ -32,10 +33,8 @@ def sphere_views(count: int, turn: float = 0.0) -> dict:
     seen = (below > 0).float()
     depth = -torch.einsum("vxyi,vi->vxy", points - c2w[:, None, None, :3, 3], c2w[:, :3, 2])
     depth = (depth - depth_of_origin(c2w)[:, None, None]) * seen
-    about = torch.tensor(turn)
     world = torch.eye(4)
-    world[0, 0] = world[2, 2] = about.cos()
-    world[0, 2], world[2, 0] = about.sin(), -about.sin()
+    world[:3, :3] = torch.from_numpy(yaw_matrix(turn))
     camera = Camera(world @ c2w, camera.intrinsics, SIDE, SIDE)
     normal = points / RADIUS @ world[:3, :3].T
     return {"camera": camera, "seen": seen, "truth": depth, "normal": normal, "color": texture(points)}

@@ -56,9 +56,8 @@ def test_a_second_call_repeats_only_what_did_not_end_well(tmp_path):
     assert [row["end"] for row in run(plan, "cpu", out, 100.0)] == ["ok", "failed (1)"]
     assert trace.read_text() == "abb"
     stored = json.loads((out / "cuda.json").read_text())
-    assert [row["name"] for row in stored["pieces"]] == ["a", "b"] and "| b | failed (1) |" in (
-        out / "cuda.md"
-    ).read_text()
+    assert [row["name"] for row in stored["pieces"]] == ["a", "b"]
+    assert "| b | failed (1) |" in (out / "cuda.md").read_text()
     assert limits(plan[1:], 100.0) == [100.0]
 
 

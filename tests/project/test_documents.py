@@ -13,9 +13,9 @@ import torch
 
 import reli3d
 from reli3d.io.hdr import write_environment
-from reli3d.render.environment import Environment
 from tests.support.checkout import ROOT, copied
 from tests.support.layers import LAYERS
+from tests.support.scenes import sky
 
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 NOT_RUN = "<!-- not run:"  # on a line of its own before a block
@@ -56,9 +56,7 @@ def folder(tmp_path, monkeypatch) -> Path:
     cameras = tmp_path / "photos" / "shoe" / "transforms.json"
     data = json.loads(cameras.read_text())
     cameras.write_text(json.dumps({**data, "frames": data["frames"][:4]}))  # of twelve, for time
-    write_environment(
-        tmp_path / "studio.hdr", Environment(torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(0)))
-    )
+    write_environment(tmp_path / "studio.hdr", sky())
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -14,7 +14,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.shading import Samples, ShadeOptions, shade
 from reli3d.synthetic.materials import Coat, Material
 from reli3d.synthetic.patterns import mosaic as spots
-from reli3d.synthetic.procedural import ProceduralObject, make_object
+from reli3d.synthetic.procedural import ProceduralObject, make_object, yaw_matrix
 from reli3d.synthetic.samples import ObjectSurface
 
 TABLE = 1.6  # half side, object's longest side 1
@@ -37,15 +37,14 @@ class TrueCapture:
 
 
 @cache
-def scene_surface(seed: int, table_yaw: float = 0.0, table: float = TABLE) -> tuple[ObjectSurface, int]:
+def scene_surface(table_yaw: float, table: float) -> tuple[ObjectSurface, int]:
     """Object and table, and the number of the object's faces.
 
     table_yaw: radians by which the table's pattern is turned about the vertical axis, as if the object had been moved
     on it.  table: its half side.
     """
-    shape = make_object(seed)
-    c, s = np.cos(table_yaw), np.sin(table_yaw)
-    turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    shape = make_object(3)
+    turn = yaw_matrix(table_yaw)
     mosaic = [spots(turn * f, 7 + k, fraction=0.5) for k, f in enumerate((9.0, 23.0, 51.0))]
     dark, light, warm = Coat((0.05, 0.06, 0.08), 0.9), Coat((0.7, 0.68, 0.6), 0.9), Coat((0.5, 0.2, 0.1), 0.9)
     stone = Material(Coat((0.3, 0.3, 0.32), 0.9), ((dark, mosaic[0]), (light, mosaic[1]), (warm, mosaic[2])))
@@ -83,16 +82,14 @@ def board(azimuth: float, origins, directions, depth) -> tuple[torch.Tensor, tor
     return front, shown[0, :, 0].T
 
 
-def render_capture(
-    seed=3, views=20, size=(400, 300), *, heights=(24, 46), moved_after=None, turntable=False, passerby=False
-) -> TrueCapture:
+def render_capture(views: int, *, heights=(24, 46), moved_after=None, turntable=False, passerby=False) -> TrueCapture:
     """A ring of hand-held views at two heights [degrees] under a sky; cameras are relative to the object.
 
     moved_after: from this view on the object is elsewhere on the table.  turntable: the camera is fixed, the object
     turns with a small table in front of a textured background.  passerby: something upright moves behind the table.
     """
     rng = np.random.default_rng(0)
-    width, height = size
+    width, height = 400, 300
     focal = 1.4 * width
     steps = np.arange(views)
     azimuth = 2 * np.pi * (steps + (0 if turntable else 1) * rng.uniform(-0.2, 0.2, views)) / views
@@ -112,7 +109,7 @@ def render_capture(
     pooled = torch.nn.functional.avg_pool2d
     for k in range(views):
         yaw = 0.6 if moved_after is not None and k >= moved_after else 0.0
-        surface, faces = scene_surface(seed, yaw, 0.7 if turntable else 1.0 if passerby else TABLE)
+        surface, faces = scene_surface(yaw, 0.7 if turntable else 1.0 if passerby else TABLE)
         environment = sky.rotated(float(azimuth[k])) if turntable else sky
         at = (torch.tensor(v, dtype=torch.float32) for v in (eye[k], target[k], roll[k] + (0, 1, 0)))
         pose = look_at(*at)
