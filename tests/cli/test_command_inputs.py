@@ -77,6 +77,8 @@ CASES = [
     *cases(render, "x.glb", "--output a.mp4 --size 47", "--size: expected an even number"),
     *cases(infer, EXAMPLE, "--texture-size 100, --resolution 4, --views 0, --workers 0, --refine -1, --refine 0steps"),
     *cases(infer, EXAMPLE, "--refine soon, --refine-cameras"),
+    *cases(infer, "example --refine -1", "--output file, --output file/out", "a file"),  # seen before the budget
+    *cases(infer, "example --refine -1", f"--output {'n' * 300}", "at most 255 bytes"),
     *cases(infer, f"{EXAMPLE} --workers 2", "--ray auto"),
     *cases(infer, EXAMPLE, "--weights nowhere.safetensors", "nowhere.safetensors"),
     *cases(infer, EXAMPLE, "--light camera", "add --refine"),

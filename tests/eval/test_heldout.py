@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-import trimesh
 
 from reli3d.errors import InputError
 from reli3d.eval import heldout
@@ -18,7 +17,9 @@ from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions
 from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.samples import ObjectSurface, synthesize
-from tests.support.meshes import mesh_from
+
+FAR = Mesh(torch.eye(3) * 1e-3 + 50.0, torch.tensor([[0, 1, 2]], dtype=torch.int32))
+AWAY = SimpleNamespace(mesh=FAR, textures=None, light=Environment(torch.ones(32, 64, 3)))  # in no camera's view
 
 
 def test_a_factor_a_channel_is_forgiven_and_a_pattern_is_not():
@@ -57,9 +58,7 @@ def test_an_empty_field_counts_as_nothing_found_and_spoils_no_mean(monkeypatch):
     assert row == {"empty": 1.0, "iou": 0.0}
     got = summary([row, {"empty": 0.0, "iou": 1.0, "x_mse": 1e-3}])
     assert (got["objects"], got["empty"], got["iou"]) == (2, 0.5, 0.5) and got["x_psnr"] == pytest.approx(30.0)
-    mesh = Mesh(torch.eye(3) * 1e-3 + 50.0, torch.tensor([[0, 1, 2]], dtype=torch.int32))
-    away = SimpleNamespace(mesh=mesh, textures=None, light=Environment(light))
-    monkeypatch.setattr(heldout, "reconstruct", lambda *args, **kwargs: away)
+    monkeypatch.setattr(heldout, "reconstruct", lambda *args, **kwargs: AWAY)
     looked, seen = [], heldout.seen_colors
     monkeypatch.setattr(heldout, "seen_colors", lambda s, camera, at: looked.append(camera.c2w) or seen(s, camera, at))
     row = evaluate(None, sample, seed, 4, light)
@@ -70,9 +69,7 @@ def test_an_empty_field_counts_as_nothing_found_and_spoils_no_mean(monkeypatch):
 def test_a_sample_of_another_object_is_refused(monkeypatch):
     seed, light = 1_000_000_002, torch.ones(32, 64, 3)
     other = synthesize(ObjectSurface(make_object(seed + 1)), light, np.random.default_rng(0), size=48, views=9)
-    mesh = mesh_from(trimesh.creation.icosphere(1))
-    maps = SimpleNamespace(mesh=mesh, textures=None, light=Environment(light))
-    monkeypatch.setattr(heldout, "reconstruct", lambda *args, **kwargs: maps)
+    monkeypatch.setattr(heldout, "reconstruct", lambda *args, **kwargs: AWAY)
     with pytest.raises(InputError, match=f"another object in the sample of seed {seed}"):
         evaluate(None, other, seed, 1, light)
 
