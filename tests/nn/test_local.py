@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import avg_pool2d, normalize
 from torch.utils.flop_counter import FlopCounterMode
 
-from reli3d.geometry.camera import Camera, camera_rays, image_plane, look_at, project
+from reli3d.geometry.camera import Camera, image_plane, look_at, project
 from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.symmetry import MirrorPlane
 from reli3d.nn.light_map import LightMap, splat
@@ -39,10 +39,15 @@ def sphere(count: int, seed: int = 0):
     eye = normalize(torch.randn(count, 3, generator=generator), dim=-1) * 2.2
     c2w = look_at(eye, torch.zeros(count, 3), torch.tensor([0.0, 1.0, 0.0]))
     intrinsics = torch.tensor([SIZE * 1.9, SIZE * 1.9, SIZE / 2, SIZE / 2]).expand(count, 4).contiguous()
-    o, d = camera_rays(Camera(c2w, intrinsics, SIZE, SIZE))
+    pixel = (torch.arange(SIZE) + 0.5 - SIZE / 2) / (SIZE * 1.9)
+    y, x = torch.meshgrid(-pixel, pixel, indexing="ij")
+    local = normalize(torch.stack([x, y, -torch.ones_like(x)], -1), dim=-1)
+    d = torch.einsum("vij,xyj->vxyi", c2w[:, :3, :3], local)
+    o = eye[:, None, None]
     b = (o * d).sum(-1)
     root = b * b - (2.2**2 - 0.4**2)
-    normal = normalize(o + d * (-b - root.clamp(min=0).sqrt())[..., None], dim=-1)
+    point = o + d * (-b - root.clamp(min=0).sqrt())[..., None]
+    normal = normalize(point, dim=-1)
     images = torch.where(root[..., None] > 0, 0.5 + 0.3 * normal, torch.full_like(normal, 0.2))
     return images, (root > 0).float(), c2w, intrinsics
 
