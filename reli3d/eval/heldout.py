@@ -144,10 +144,7 @@ def table(
     symmetry: str = "auto",
 ) -> dict[int, dict]:
     """:func:`summary` of the samples in ``folder`` for each number of views.  progress: called for each object."""
-    files = sorted(folder.glob("*.safetensors"))
-    if not files:
-        raise InputError(folder, "expected *.safetensors files, got none; make samples with reli3d-data render")
-    out = {}
+    files, out = sorted(folder.glob("*.safetensors")), {}
     for count in counts:
         rows = []
         for path in files:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -17,7 +18,7 @@ from reli3d.cli import infer, objects
 from reli3d.errors import InputError
 from tests.support.checkout import ROOT
 from tests.support.example import QUICK
-from tests.support.jobs import Start
+from tests.support.jobs import WordJob
 from tests.support.processes import heed_signals
 
 WORDS = ["one", "crash once", "three", "refuse", "crash", "six", "fail", "eight", "nine", "crash once"]
@@ -36,7 +37,7 @@ def read_table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def rows(where: str, start: Start, items: list[objects.Item]):
+def rows(where: str, start: Callable, items: list[objects.Item]):
     if where == "here":
         job = start()
         return [objects.make(job, item) for item in items]
@@ -50,7 +51,7 @@ def rows(where: str, start: Start, items: list[objects.Item]):
 def test_every_object_has_one_row_and_one_result(tmp_path, where):
     words = [w for w in WORDS if "crash" not in w]
     items = folders(tmp_path, words)
-    found = {row.object: row for row in rows(where, Start(tmp_path / "log"), items)}
+    found = {row.object: row for row in rows(where, WordJob(tmp_path / "log").start(), items)}
     assert list(sorted(found)) == [item.name for item in items]
     for item, word in zip(items, words, strict=True):
         row = found[item.name]
@@ -62,7 +63,7 @@ def test_every_object_has_one_row_and_one_result(tmp_path, where):
             assert (item.target / "mesh.glb").read_text() == word and not row.retried
             assert (row.result, row.mask_iou, row.faces) == ("done", 0.5, len(word)) and row.seconds >= 0
     assert sorted((tmp_path / "log").read_text().split()) == sorted(i.name for i in items if i.target.exists())
-    again = rows("here", Start(tmp_path / "log"), items)
+    again = rows("here", WordJob(tmp_path / "log").start(), items)
     assert [r.result for r in again].count("skipped") == len(words) - 2
     assert all(r.faces and r.seconds is None for r in again if r.result == "skipped")
 
@@ -71,7 +72,7 @@ def test_every_object_has_one_row_and_one_result(tmp_path, where):
 @pytest.mark.parametrize("where", ["processes", WITH_RAY])
 def test_a_worker_that_crashes_loses_nothing_and_its_object_is_made_once_more(tmp_path, capsys, where):
     items = folders(tmp_path, WORDS)
-    found = rows(where, Start(tmp_path / "log"), items)
+    found = rows(where, WordJob(tmp_path / "log").start(), items)
     assert sorted(row.object for row in found) == [item.name for item in items]  # one row each
     retried = {row.object for row in found if row.retried}
     assert retried >= {item.name for item, word in zip(items, WORDS, strict=True) if "crash" in word}
