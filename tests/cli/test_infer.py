@@ -170,7 +170,7 @@ def test_weights_that_ignore_the_background_refuse_it(tmp_path, capsys):
     assert not any((tmp_path / "out").glob("*/*"))
 
 
-def test_a_negative_axis_may_be_a_word_of_its_own(tmp_path):
+def test_a_negative_axis_may_be_a_word_of_its_own():
     for words in (["--up", "-z"], ["--up=-z"]):
         assert infer.parser().parse_args(joined(["a", *words], "--up", infer.AXES)).up == "-z"
     assert joined(["--up", "z", "-z", "--up"], "--up", infer.AXES) == ["--up=z", "-z", "--up"]

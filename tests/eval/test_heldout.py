@@ -75,7 +75,7 @@ def test_a_sample_of_another_object_is_refused(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_shipped_weights_beat_a_guess_on_an_object(tmp_path):
+def test_the_shipped_weights_beat_a_guess_on_an_object():
     """One held-out object end to end: shape far better than chance, light better than the mean of two other skies."""
     seed = 1_000_000_002
     light = 0.2 + 3.0 * lat_long_directions(32)[..., 1:2].clamp(min=0).expand(-1, -1, 3).contiguous()

@@ -170,7 +170,7 @@ def test_a_mirror_shows_the_light_where_it_reflects_it():
         torch.testing.assert_close(got, expected, rtol=0, atol=1e-5)  # float32 angles
 
 
-def test_pixels_start_as_observed(model):
+def test_pixels_start_as_observed():
     """Of zeros: the normal looks at the camera, nothing is added to the color."""
     _, _, c2w, intrinsics = sphere(4)
     camera = Camera(c2w, intrinsics / 2, 32, 32)

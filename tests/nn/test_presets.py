@@ -107,7 +107,7 @@ def test_a_file_with_an_impossible_preset_is_refused_before_any_tensor(tmp_path,
     tracemalloc.stop()
 
 
-def test_the_largest_maps_of_a_preset_allocate_nothing_before_shapes_are_compared(tmp_path):
+def test_the_largest_maps_of_a_preset_allocate_nothing_before_shapes_are_compared():
     """512 rows of directions are 6 MiB; on the meta device there are none."""
     preset = dataclasses.replace(OFFICIAL, reni=dataclasses.replace(OFFICIAL.reni, height=512))
     with torch.device("meta"):

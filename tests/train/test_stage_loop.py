@@ -189,7 +189,7 @@ def test_checkpointing_and_bfloat16_keep_the_loss(folder):
     assert float(cosine) > 0.97
 
 
-def test_a_checkpoint_is_exported_and_starts_the_next_stage(folder, tmp_path, capsys):
+def test_a_checkpoint_is_exported_and_starts_the_next_stage(folder, tmp_path):
     torch.manual_seed(0)
     stage = stage_of(folder, BallModel(TINY))
     train(stage, options_of(stage, tmp_path / "one", steps=0))
