@@ -44,8 +44,8 @@ def lpips_distance() -> Perceptual:
     """LPIPS (Zhang et al. 2018) with VGG features, or InputError if anything is missing; downloads nothing."""
     try:
         import lpips
-    except ImportError:
-        problem = "expected the package lpips, got none; pip install lpips"
+    except (ImportError, RuntimeError):  # RuntimeError: of a torchvision that was built for another torch
+        problem = "expected the package lpips and the torchvision of this torch, got none; pip install lpips"
         raise InputError("--perceptual", f"{problem}, or use --perceptual gradients") from None
     weights = torch.hub.get_dir() + "/checkpoints/vgg16-397923af.pth"
     if not os.access(weights, os.R_OK):
