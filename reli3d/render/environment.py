@@ -183,9 +183,10 @@ class _Lookup(torch.autograd.Function):
         radiance, directions = ctx.saved_tensors
         n, device, needed = directions.shape[0], directions.device, ctx.needs_input_grad
         height, width = radiance.shape[:2]
-        least = max(SLICE_MIN, height * width)  # a slice's own accumulator must not cost more than its lookups
-        parts = slices(n, least) if device.type == "cpu" else [(0, n)]
-        g_radiance = torch.zeros(len(parts), height if needed[0] else 0, width, 3, device=device, dtype=torch.float32)
+        # a slice's own accumulator must not cost more than its lookups; on CUDA one launch for all
+        least = max(SLICE_MIN, height * width) if device.type == "cpu" else n + 1
+        parts = len(slices(n, least))
+        g_radiance = torch.zeros(parts, height if needed[0] else 0, width, 3, device=device, dtype=torch.float32)
         g_directions = torch.empty(n if needed[1] else 0, 3, device=device, dtype=torch.float32)
         ins = [radiance, directions, g_out.contiguous()]
 
@@ -193,10 +194,7 @@ class _Lookup(torch.autograd.Function):
             outs = [g_radiance[k], g_directions]
             launch(kernels.lookup_adjoint_kernel, count, [start, *ins, *outs], device, slice_min=count)
 
-        if n and device.type == "cpu":
-            over_slices(n, work, slice_min=least)
-        elif n:
-            work(0, 0, n)
+        over_slices(n, work, slice_min=least)
         return g_radiance.sum(0) if needed[0] else None, g_directions if needed[1] else None
 
 

@@ -10,12 +10,10 @@ density 0.  Densities have no gradient: detach the directions to differentiate a
 """
 
 import torch
-import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import call, empty, launch
 from reli3d.kernels import bsdf as kernels
-from reli3d.render.sampling import flattened, reflect, sample_cosine, sample_ggx_vndf
+from reli3d.render.sampling import broadcast_call, reflect, sample_cosine, sample_ggx_vndf
 
 DIFFUSE_MODELS = ("conserving", "published")  # energy transmitted to the diffuse layer: reli3d.kernels.bsdf
 LOBES = ("visible", "mirrored", "cosine")  # in the order of the kernel's columns
@@ -45,12 +43,8 @@ def eval_bsdf(
     >>> value = reli3d.eval_bsdf(up, torch.full((3,), 0.8), half, half, up)
     """
     conserving = int(choice("diffuse_model", diffuse_model, DIFFUSE_MODELS) == 0)
-    batch, flat = flattened(
-        [("wo", wo, 3), ("wi", wi, 3), ("base_color", base_color, 3), ("alpha", alpha, 0), ("metallic", metallic, 0)]
-    )
-    n = flat[0].shape[0]
-    (out,) = call(kernels.eval_bsdf_kernel, n, [*flat, conserving], [(n,)])
-    return out.reshape(*batch, 3)
+    material = [("base_color", base_color, 3), ("alpha", alpha, 0), ("metallic", metallic, 0)]
+    return broadcast_call(kernels.eval_bsdf_kernel, [("wo", wo, 3), ("wi", wi, 3), *material], conserving)
 
 
 def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") -> Tensor:
@@ -93,10 +87,7 @@ def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") ->
     return pdf_lobes(wo, alpha, wi)[..., choice("lobe", lobe, LOBES)]
 
 
+@torch.no_grad()
 def pdf_lobes(wo: Tensor, alpha: Tensor, wi: Tensor) -> Tensor:
     """:func:`pdf_bsdf` for each of :data:`LOBES`, ``(..., 3)``."""
-    batch, flat = flattened([("wo", wo, 3), ("wi", wi, 3), ("alpha", alpha, 0)])
-    ins = [t.detach().contiguous() for t in flat]
-    out = empty((flat[0].shape[0],), wp.vec3, wo.device)
-    launch(kernels.pdf_lobes_kernel, out.shape[0], [*ins, out], wo.device)
-    return out.reshape(*batch, 3)
+    return broadcast_call(kernels.pdf_lobes_kernel, [("wo", wo, 3), ("wi", wi, 3), ("alpha", alpha, 0)])

@@ -21,10 +21,11 @@ def sample_cosine(u: Tensor) -> Tensor:
     return torch.stack([radius * angle.cos(), radius * angle.sin(), (1.0 - square).sqrt()], -1)
 
 
-def flattened(items: list[tuple[str, Tensor, int]]) -> tuple[torch.Size, list[Tensor]]:
-    """Checked and broadcast operands, flattened to ``(N, k)`` or ``(N,)``; ``items`` hold name, value and last axis.
+def broadcast_call(kernel, items: list[tuple[str, Tensor, int]], *plain) -> Tensor:
+    """The output of ``kernel(start, *operands, *plain)`` at all broadcast operands, by :func:`reli3d._bridge.call`.
 
-    Raises TypeError unless float32, ValueError for a wrong shape or device and for shapes that do not broadcast.
+    items: name, value and length of the last axis of each operand, 0 for numbers.  Raises TypeError unless float32,
+    ValueError for a wrong shape or device and for shapes that do not broadcast.
     """
     first = items[0][1]
     for name, value, last in items:
@@ -36,7 +37,8 @@ def flattened(items: list[tuple[str, Tensor, int]]) -> tuple[torch.Size, list[Te
         names, got = (", ".join(map(str, part)) for part in ([name for name, _, _ in items], shapes))
         raise ValueError(f"{names}: expected shapes that broadcast, got {got}") from None
     flat = [v.expand(*batch, last).reshape(-1, last) if last else v.expand(batch).reshape(-1) for _, v, last in items]
-    return batch, flat
+    (out,) = call(kernel, batch.numel(), [*flat, *plain], [(batch.numel(),)])
+    return out.reshape(*batch, *out.shape[1:])
 
 
 def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
@@ -50,10 +52,8 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
     >>> wo, alpha = torch.tensor([0.6, 0.0, 0.8]), torch.tensor(0.25)
     >>> wm = reli3d.sample_ggx_vndf(wo, alpha, torch.rand(4096, 2))
     """
-    batch, ins = flattened([("wo", wo, 3), ("alpha", alpha, 0), ("u", u.detach(), 2)])
-    n = batch.numel()
-    (wm,) = call(microfacet.sample_ggx_vndf_kernel, n, ins, [(n,)])
-    return wm.reshape(*batch, 3)
+    items = [("wo", wo, 3), ("alpha", alpha, 0), ("u", u.detach(), 2)]
+    return broadcast_call(microfacet.sample_ggx_vndf_kernel, items)
 
 
 def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
@@ -67,10 +67,7 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
     >>> wm = reli3d.sample_ggx_vndf(wo, alpha, u)
     >>> density = reli3d.pdf_ggx_vndf(wo, alpha, wm)
     """
-    batch, ins = flattened([("wo", wo, 3), ("alpha", alpha, 0), ("wm", wm, 3)])
-    n = batch.numel()
-    (pdf,) = call(microfacet.pdf_ggx_vndf_kernel, n, ins, [(n,)])
-    return pdf.reshape(batch)
+    return broadcast_call(microfacet.pdf_ggx_vndf_kernel, [("wo", wo, 3), ("alpha", alpha, 0), ("wm", wm, 3)])
 
 
 def antithetic(u: Tensor) -> Tensor:

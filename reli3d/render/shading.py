@@ -177,28 +177,21 @@ class _Shade(torch.autograd.Function):
         *tensors, visible = ctx.saved_tensors
         n, device, needed = g_out.shape[0], g_out.device, ctx.needs_input_grad[1:]
         least = slice_of_accumulators(n, SLICE_MIN, tensors[7].numel() if needed[7] else 0)
-        parts = len(slices(n, least)) if device.type == "cpu" else 1
+        least = least if device.type == "cpu" else n + 1  # on CUDA one launch for all
         # gradients that are not needed have no rows, and the kernel skips them
         g_normal, g_base, g_alpha, g_metallic, texels = (
             torch.zeros_like(tensors[k] if needed[k] else tensors[k][:0]) for k in (1, 4, 5, 6, 7)
         )
-        g_radiance = texels.repeat(parts, 1, 1, 1)  # of each slice
-        ins = _inputs(tensors, ctx.job)
-        ins += [ctx.job.plan, visible, g_out.contiguous()]
+        g_radiance = texels.repeat(len(slices(n, least)), 1, 1, 1)  # of each slice
+        ins = [*_inputs(tensors, ctx.job), ctx.job.plan, visible, g_out.contiguous()]
         outs = [g_normal, g_base, g_alpha, g_metallic]
 
         def work(k, start, length):
-            size = SLICE_MIN if device.type == "cpu" else length  # a launch this small stays in its thread
-            for first in range(start, start + length, size):
-                hits = min(size, start + length - first)
-                args = [first, *ins, *outs, g_radiance[k]]
-                launch(adjoint.shade_adjoint_kernel, hits, args, device)
+            args = [start, *ins, *outs, g_radiance[k]]
+            launch(adjoint.shade_adjoint_kernel, length, args, device, slice_min=length)  # stays in its thread
 
-        if n and ctx.job.count:
-            if device.type == "cpu":
-                over_slices(n, work, slice_min=least)
-            else:
-                work(0, 0, n)
+        if ctx.job.count:
+            over_slices(n, work, slice_min=least)
         grads = [None, g_normal, None, None, g_base, g_alpha, g_metallic, g_radiance.sum(0), None]
         return None, *(g if w else None for g, w in zip(grads, needed, strict=True))
 
