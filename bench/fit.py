@@ -17,7 +17,7 @@ from bench.timing import Clock
 from reli3d._bridge import present
 from reli3d.fit import losses
 from reli3d.fit.fields import EvenAdam, blurred_grid
-from reli3d.fit.shading import radiance
+from reli3d.fit.lighting import radiance
 from reli3d.fit.shape import Grid, extracted
 from reli3d.fit.unknowns import (
     LIGHT_ROWS,

@@ -4,5 +4,5 @@ Modules, imported by name (``import reli3d.fit.maps``):
 
 - stages: refine (all of them), shape, material_start, maps, lighting
 - data: input_images, view_colors, bounce, light_frame, light_hue
-- parts: losses, unknowns, fields, shading, choice, budget, facets, transfer
+- parts: losses, unknowns, fields, choice, budget, facets, transfer
 """

@@ -9,25 +9,26 @@ from dataclasses import dataclass, field
 
 from tqdm import tqdm
 
-from reli3d._bridge import present
-
 
 @dataclass
 class Budget:
     """Budget in seconds or steps for the parts of a fit; only ``steps`` gives the same result on every run.
 
-    curve: one entry every ``CURVE_STEPS`` steps, ``{part, step, seconds, loss}``.  interrupt: called before every
-    step.  interrupted: whether ``interrupt`` returned True; the current part then ends, and later parts take no step.
+    show: whether to show a progress bar on stderr.  curve: one entry every ``CURVE_STEPS`` steps, ``{part, step,
+    seconds, loss}``.  counts: steps of each part.  interrupt: called before every step.  interrupted: whether
+    ``interrupt`` returned True; the current part then ends, and later parts take no step.
     """
 
     seconds: float | None = None
     steps: int | None = None
-    bar: tqdm | None = None
-    curve: list[dict] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=dict)
+    show: bool = False
     interrupt: Callable[[], bool] | None = None
     interrupted: bool = False
+    curve: list[dict] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
     began: float = field(default_factory=time.perf_counter)
+    limit: float = field(init=False)
+    bar: tqdm | None = field(init=False, default=None)
 
     CURVE_STEPS = 10
 
@@ -38,38 +39,36 @@ class Budget:
             raise ValueError(f"seconds: expected a positive number, got {self.seconds}")
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps: expected at least 1, got {self.steps}")
+        self.limit = self.seconds or self.steps or 0
+        if self.show:
+            layout = "refine: {bar:20} {n:.0f}/{total:.0f} {unit} {postfix} {remaining}"
+            style = {"unit": "s" if self.seconds else "steps", "bar_format": layout, "leave": False}
+            self.bar = tqdm(total=self.limit, file=sys.stderr, disable=None, **style)
 
     def part(self, name: str, until: float) -> Iterator[tuple[int, float]]:
         """Yields ``(step, progress)``, progress in [0, 1), until the fraction ``until`` of the whole budget is used.
 
         With a budget in seconds, progress follows the clock.  A part that would begin after its end takes no step.
         """
-        started = time.perf_counter() - self.began
-        done = sum(self.counts.values())
         count = self.counts[name] = 0
+        start, end = self.spent(), self.limit * until
+        end = round(end) if self.steps else end
         while True:
             self.interrupted |= self.interrupt is not None and self.interrupt()
-            if self.interrupted:
+            now = self.spent()
+            if self.interrupted or now >= end:
                 return
-            if self.steps is not None:
-                total = round(self.steps * until) - done
-                progress = count / max(total, 1)
-                if count >= total:
-                    return
-            elif self.seconds is not None:
-                now = time.perf_counter() - self.began
-                if now >= self.seconds * until:
-                    return
-                progress = (now - started) / (self.seconds * until - started)
-            yield count, progress
+            yield count, (now - start) / (end - start)
             count += 1
             self.counts[name] = count
 
+    def spent(self) -> float:
+        """Steps, or seconds with a budget in seconds."""
+        return sum(self.counts.values()) if self.steps else time.perf_counter() - self.began
+
     def used(self) -> float:
         """Fraction of the budget that is used."""
-        if self.steps is not None:
-            return sum(self.counts.values()) / self.steps
-        return (time.perf_counter() - self.began) / present("seconds", self.seconds)
+        return self.spent() / self.limit
 
     def record(self, name: str, step: int, loss: float) -> None:
         """Records the loss of a step in the curve and on the progress bar."""
@@ -77,12 +76,5 @@ class Budget:
             seconds = round(time.perf_counter() - self.began, 3)
             self.curve.append({"part": name, "step": step, "seconds": seconds, "loss": round(loss, 6)})
         if self.bar is not None:
-            used = sum(self.counts.values()) if self.steps is not None else time.perf_counter() - self.began
-            self.bar.n = min(used, self.bar.total)
+            self.bar.n = min(self.spent(), self.bar.total)
             self.bar.set_postfix_str(f"{name} {loss:.4f}")
-
-
-def progress_bar(budget_total: float, unit: str) -> tqdm:
-    """Progress bar on stderr, in seconds or steps."""
-    layout = "refine: {bar:20} {n:.0f}/{total:.0f} {unit} {postfix} {remaining}"
-    return tqdm(total=budget_total, unit=unit, file=sys.stderr, bar_format=layout, leave=False, disable=None)

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from reli3d.fit.bounce import reflected
 from reli3d.fit.input_images import InputImages
-from reli3d.fit.lighting import Lights
-from reli3d.fit.shading import radiance
+from reli3d.fit.lighting import Lights, radiance
 from reli3d.fit.transfer import changed
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.geometry.hits import interpolate

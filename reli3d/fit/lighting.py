@@ -1,4 +1,4 @@
-"""Lighting of the input images: a map fixed to the object, a map fixed to the camera, or a map per group of views."""
+"""Lighting of the input images, by a map fixed to the object or the camera or a map per group; shading by it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,13 @@ from torch import Tensor
 
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.unknowns import Start, Unknowns, light_maps
+from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions
 from reli3d.render.points import SurfacePoints
+from reli3d.render.shading import ShadeOptions, shade
+
+DIFFUSE_MODEL = "published"  # glTF's formula: that of viewers and of the shipped weights' training data
 
 
 @dataclass(frozen=True)
@@ -59,3 +63,17 @@ class Lights:
             rows = torch.nonzero(first[view] == k)[:, 0]
             out = out.index_copy(0, rows, radiance(points[rows], wo[rows], self.of_view(k)))
         return out
+
+
+def radiance(
+    points: SurfacePoints,
+    wo: Tensor,
+    light: Environment,
+    *,
+    samples: tuple[int, int, int],
+    scene: RayScene | None,
+    seed: int,
+) -> Tensor:
+    """Linear radiance ``(N, 3)`` from ``points`` towards ``wo (N, 3)`` by direct light.  scene: None: no shadows."""
+    options = ShadeOptions(samples=samples, seed=seed, diffuse_model=DIFFUSE_MODEL)
+    return shade(points, wo, light, scene=scene, options=options)

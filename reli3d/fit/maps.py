@@ -13,8 +13,7 @@ from reli3d.fit import losses
 from reli3d.fit.bounce import reflected
 from reli3d.fit.budget import Budget
 from reli3d.fit.input_images import SATURATED_LINEAR, InputImages
-from reli3d.fit.lighting import Lights
-from reli3d.fit.shading import radiance
+from reli3d.fit.lighting import Lights, radiance
 from reli3d.fit.unknowns import Start, Unknowns, bent, material_change, material_logits, material_of
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.rays import RayScene
@@ -111,7 +110,7 @@ def maps_loss(
 ) -> Tensor:
     """Loss of one step over ``rows`` of the pixels; gradients reach material, detail, bend, light and exposure.
 
-    scene, samples: of :func:`~reli3d.fit.shading.radiance`.  seed: of the light samples.  independent: as in
+    scene, samples: of :func:`~reli3d.fit.lighting.radiance`.  seed: of the light samples.  independent: as in
     :func:`~reli3d.fit.shape.shape_loss`.
     """
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
@@ -175,11 +174,11 @@ def fit_maps(
     if count == 0:
         return
     names = ("light", "exposure", "material", *(("detail", "bend") if detail else ()))
-    groups, opens = [], []
+    groups = []
     for which in names:
         for k, value in enumerate(unknowns.groups()[which]):
-            groups.append({"params": [value], "lr": 0.0, "full": LEARNING_RATES[which]})
-            opens.append(DETAIL_FROM if which == "detail" else GRID_INTERVAL * k)
+            opens = DETAIL_FROM if which == "detail" else GRID_INTERVAL * k
+            groups.append({"params": [value], "lr": 0.0, "full": LEARNING_RATES[which], "opens": opens})
             value.requires_grad_(True)
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     first, settled = 0, False
@@ -191,8 +190,8 @@ def fit_maps(
                 value.requires_grad_(False)
             unknowns.reset_bend()
         fade = fading(progress, settled)
-        for group, opening in zip(optimizer.param_groups, opens, strict=True):
-            group["lr"] = group["full"] * fade if progress >= opening else 0.0
+        for group in optimizer.param_groups:
+            group["lr"] = group["full"] * fade if progress >= group["opens"] else 0.0
         end = first + min(PIXELS_PER_STEP, count)
         rows = pixels.order[torch.arange(first, end, device=pixels.order.device, dtype=torch.int64) % count]
         first = (first + PIXELS_PER_STEP) % count

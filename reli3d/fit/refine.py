@@ -12,7 +12,7 @@ from torch import Tensor
 from reli3d._bridge import full_precision
 from reli3d.fit import losses
 from reli3d.fit.bounce import gathered
-from reli3d.fit.budget import Budget, progress_bar
+from reli3d.fit.budget import Budget
 from reli3d.fit.choice import UNCHANGED, Fitted, Parts, chosen, mean_psnr, view_errors
 from reli3d.fit.input_images import InputImages, PosedImages
 from reli3d.fit.light_frame import light_follows_camera
@@ -122,9 +122,7 @@ def refine(
     """
     images = InputImages.of(views, options.light)
     _check_asset(asset, images)
-    budget = Budget(seconds, steps, interrupt=interrupt)
-    if bar:
-        budget.bar = progress_bar(seconds or steps or 0, "s" if seconds else "steps")
+    budget = Budget(seconds, steps, bar, interrupt)
     held = held_out(len(images))
     used = [v for v in range(len(images)) if v not in held]
     low, high = asset.mesh.vertices.detach().aminmax(dim=0)
@@ -155,12 +153,13 @@ def refine(
     if budget.interrupted:
         notes.append("refinement: interrupted, the best result so far is kept")
     notes.append(f"refinement: {parts}")
-    after = before if parts == UNCHANGED else after
-    was, now = ((mean_psnr(e[used]), mean_psnr(e[list(held)])) for e in (before, after))
+    back, c2w = (-scale * shift, 1.0 / scale), views.c2w
     if parts == UNCHANGED:
-        return Refinement(asset, parts, was, now, held, views.c2w, tuple(notes), budget.curve, budget.counts)
-    kept, near = _moved(kept, -scale * shift, 1.0 / scale), fitted.images.moved(-scale * shift, 1.0 / scale)
-    return Refinement(kept, parts, was, now, held, near.camera.c2w, tuple(notes), budget.curve, budget.counts)
+        kept, after = asset, before
+    else:
+        kept, c2w = _moved(kept, *back), fitted.images.moved(*back).camera.c2w
+    was, now = ((mean_psnr(e[used]), mean_psnr(e[list(held)])) for e in (before, after))
+    return Refinement(kept, parts, was, now, held, c2w, tuple(notes), budget.curve, budget.counts)
 
 
 def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: list[str]) -> Fitted:

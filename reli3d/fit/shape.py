@@ -16,8 +16,7 @@ from reli3d.fit.budget import Budget
 from reli3d.fit.facets import flattened
 from reli3d.fit.fields import EvenAdam, blurred_grid
 from reli3d.fit.input_images import SATURATED_LINEAR, InputImages
-from reli3d.fit.lighting import Lights
-from reli3d.fit.shading import radiance
+from reli3d.fit.lighting import Lights, radiance
 from reli3d.fit.unknowns import Start, Unknowns, corrected, material_change, material_of, unit
 from reli3d.fit.view_colors import MIN_COVERAGE, display_planes, view_colors, view_weights
 from reli3d.geometry.distance import signed_distance

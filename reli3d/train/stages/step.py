@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from reli3d.fit.shading import DIFFUSE_MODEL
+from reli3d.fit.lighting import DIFFUSE_MODEL
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.model import Code, Reconstructor
