@@ -8,21 +8,9 @@ import torch
 from torch.nn.functional import normalize
 
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
-from reli3d.render.latlong import texel_solid_angles
 from tests.support import reference
 from tests.support.lobes import irradiance
 from tests.support.surfaces import on_ball
-
-ROWS = 96  # midpoint rule; a lobe of sharpness 200 is 4 degrees wide, two rows
-
-
-def sphere(rows=ROWS):
-    """Directions and solid angles of a fine lat-long grid, float64."""
-    phi = (torch.arange(rows, dtype=torch.float64) + 0.5) / rows * torch.pi
-    theta = (torch.arange(2 * rows, dtype=torch.float64) + 0.5) / rows * torch.pi
-    y, s = torch.cos(phi)[:, None].expand(rows, 2 * rows), torch.sin(phi)[:, None]
-    d = torch.stack([s * torch.cos(theta), y, s * torch.sin(theta)], -1).reshape(-1, 3)
-    return d, texel_solid_angles(rows, 2 * rows).repeat_interleave(2 * rows)
 
 
 def lobes(device, count=5, low=0.05, high=150.0, seed=0):
@@ -43,7 +31,7 @@ def leaves(tensors):
 
 def test_irradiance_and_gradients_match_quadrature(device):
     """Every sharpness from nearly constant to 150 and normals all around, behind the lobe too."""
-    d, solid = sphere()
+    d, solid = reference.sphere_grid(200)  # a lobe of sharpness 150 is 5 degrees wide, 8 rows
     own, rng = leaves(lobes(device, 24)), torch.Generator().manual_seed(2)
     normals = normalize(torch.randn(48, 3, generator=rng), dim=-1).to(device).requires_grad_()
     doubles, at = leaves([t.detach().cpu().double() for t in own]), normals.detach().cpu().double().requires_grad_()
@@ -83,16 +71,11 @@ def test_irradiance_is_exact_along_the_axis(device, sharpness):
 
 def reflected(wo, base, alpha, metallic, axis, sharpness):
     """Quadrature of the material times one white lobe, normal +z, float64."""
-    d, solid = sphere(180)
-    wi, solid = d[d[:, 2] > 1e-6], solid[d[:, 2] > 1e-6]
-    wm = normalize(wi + wo, dim=-1)
-    f0 = 0.04 * (1 - metallic) + base * metallic
-    fresnel = f0 + (1 - f0) * (1 - (wm * wo).sum(-1, keepdim=True)) ** 5
-    masking = 1 / (1 + reference.smith_lambda(wo, alpha) + reference.smith_lambda(wi, alpha))
-    specular = (reference.ggx_ndf(wm, alpha) * masking / (4 * wo[2] * wi[:, 2]))[:, None]
-    value = fresnel * specular + (1 - fresnel) * base * (1 - metallic) / torch.pi
-    light = torch.exp(sharpness * (wi @ axis - 1.0)) * wi[:, 2] * solid
-    return (value * light[:, None]).sum(0)
+    d, solid = reference.sphere_grid(256)
+    wi = d[d[:, 2] > 1e-6]
+    rows = [v.expand(len(wi), *v.shape) for v in (base, alpha, metallic)]
+    value = reference.eval_bsdf(wo.expand(len(wi), 3), wi, *rows, "published")
+    return (value * (torch.exp(sharpness * (wi @ axis - 1.0)) * wi[:, 2])[:, None]).sum(0) * solid
 
 
 CASES = [
@@ -109,7 +92,8 @@ def test_shading_matches_quadrature(device):
         angle = torch.deg2rad(torch.tensor(float(deg), dtype=torch.float64))
         wo = torch.stack([angle.sin(), torch.zeros_like(angle), angle.cos()])
         axis = normalize(wo * torch.tensor([-1.0, 1.0, 1.0]) + torch.tensor([0.05, 0.1, 0.0]), dim=-1)  # by the mirror
-        expected = reflected(wo, base, torch.tensor(roughness**2, dtype=torch.float64), metallic, axis, sharpness)
+        alpha, metal = torch.tensor([roughness**2, metallic], dtype=torch.float64)
+        expected = reflected(wo, base, alpha, metal, axis, sharpness)
         rows = [t.float().to(device)[None] for t in (torch.tensor([0.0, 0, 1]), wo, base)]
         light = SphericalGaussians(
             axis.float().to(device)[None], torch.tensor([sharpness], device=device), torch.ones(1, 3, device=device)
