@@ -39,11 +39,3 @@ def test_values_and_gradients_are_those_of_the_formula_in_float64(device):
     (gradient,) = torch.autograd.grad((got.view(2000, 3) * weight.to(device)).sum(), leaf)
     (true,) = torch.autograd.grad((expected * weight).sum(), exact)
     torch.testing.assert_close(gradient.view(2000, 3).cpu().double(), true, rtol=0, atol=2e-4)  # over lengths above 0.1
-
-
-def test_a_flat_bump_is_the_normal():
-    generator = torch.Generator().manual_seed(3)
-    position, normal = torch.randn(500, 3, generator=generator), torch.randn(500, 3, generator=generator)
-    normal = torch.nn.functional.normalize(normal, dim=-1)
-    flat = torch.tensor([0.0, 0.0, 1.0]).expand(500, 3)
-    torch.testing.assert_close(radial_bump(position, normal, flat), normal, rtol=0, atol=1e-6)

@@ -109,6 +109,7 @@ def test_bad_input_is_named(device):
         ({"options": {"seed": 1}}, TypeError, "options"),
         ({"points": (normal, wo)}, TypeError, "points"),
         ({"sequence": "sobol"}, ValueError, "sequence"),
+        ({"alpha": "cubed"}, ValueError, "alpha"),
         ({"seed": 1.5}, TypeError, "seed"),
         ({"wo": wo[:2]}, ValueError, "wo"),
         ({"normal": 0.5}, TypeError, "normal"),

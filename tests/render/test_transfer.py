@@ -10,6 +10,7 @@ import trimesh
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
+from reli3d.render.latlong import lat_long_directions
 from reli3d.render.transfer import blocked_transfer, light_harmonics, spherical_harmonics
 from tests.support.meshes import mesh_from
 
@@ -49,9 +50,7 @@ def smooth_light(degree, height=32):
     """A positive light of random harmonics up to ``degree``, and their coefficients ``((degree + 1)^2, 3)``."""
     coefficients = torch.randn((degree + 1) ** 2, 3, generator=torch.Generator().manual_seed(1)) * 0.2
     coefficients[0] = 3.0
-    phi = (torch.arange(2 * height) + 0.5) * (math.pi / height) - math.pi
-    theta = ((torch.arange(height) + 0.5) * (math.pi / height))[:, None]
-    d = torch.stack([phi.cos() * theta.sin(), theta.cos().expand(-1, 2 * height), phi.sin() * theta.sin()], -1)
+    d = lat_long_directions(height)
     return Environment(spherical_harmonics(d)[..., : len(coefficients)] @ coefficients), coefficients, d
 
 
@@ -72,11 +71,7 @@ def test_a_convex_surface_hides_nothing_from_itself(device):
 def test_a_wall_occludes_half_of_the_hemisphere_of_a_floor(device):
     """Of a small floor at the foot of a tall wall, in the wall's middle: the integral over a quarter of the sphere."""
     small, large = 0.01, 1000.0
-    floor = [
-        [-small, 0.0, small],
-        [small, 0.0, small],
-        [0.0, 0.0, 2 * small],
-    ]  # the wall is at z = 0, the floor in front
+    floor = [[-small, 0.0, small], [small, 0.0, small], [0.0, 0.0, 2 * small]]  # in front of the wall at z = 0
     wall = [[-large, -1.0, 0.0], [large, -1.0, 0.0], [0.0, large, 0.0]]
     vertices = torch.tensor(floor + wall, device=device)
     faces = torch.tensor([[0, 2, 1], [3, 4, 5]], dtype=torch.int32, device=device)
@@ -108,9 +103,8 @@ def test_missing_irradiance_is_that_of_a_monte_carlo_estimate(device):
     expected, whole = (cosine * hidden) @ radiance, cosine @ radiance
     assert float((expected / whole).min()) < 0.1 and float((expected / whole).max()) > 0.9
     for directions, mean, most in ((64, 0.04, 0.2), (4096, 0.006, 0.03)):
-        error = (
-            (blocked_transfer(mesh, directions=directions)[chosen] @ light_harmonics(light) - expected) / whole
-        ).abs()
+        got = blocked_transfer(mesh, directions=directions)[chosen] @ light_harmonics(light)
+        error = ((got - expected) / whole).abs()
         assert error.mean() < mean and error.max() < most, (directions, error.mean(), error.max())
 
 
