@@ -21,12 +21,9 @@ def space_field(grids: Sequence[Tensor], points: Tensor) -> Tensor:
 
 def blurred_grid(grid: Tensor, cells: int) -> Tensor:
     """``grid (X, Y, Z)`` averaged over blocks of ``cells`` per side, interpolated between block centers."""
-    if cells <= 1:
-        return grid
-    shape = grid.shape
-    small = tuple(max(1, -(-n // cells)) for n in shape)
+    small = tuple(max(1, -(-n // cells)) for n in grid.shape)
     coarse = interpolate(grid[None, None], small, mode="area")
-    return interpolate(coarse, tuple(shape), mode="trilinear", align_corners=False)[0, 0]
+    return interpolate(coarse, tuple(grid.shape), mode="trilinear", align_corners=False)[0, 0]
 
 
 class EvenAdam:

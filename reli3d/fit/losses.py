@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from reli3d.fit.input_images import SATURATED_LINEAR
 from reli3d.fit.unknowns import Unknowns, light_maps
 
 MIN_LINEAR = 0.02  # linear radiance below which the display's derivative is constant: there images contain mostly noise
@@ -61,6 +62,18 @@ def display_error(image: Tensor, other: Tensor, target: Tensor, bright: Tensor) 
     value = residual * difference + residual * (full - residual)  # quadratic, then linear
     surrogate = 2.0 * residual * derivative * image  # has the gradient
     return (value + surrogate - surrogate.detach()).mean()
+
+
+def estimated_error(lit: Callable[[int], Tensor], target: Tensor, seed: int, independent: bool) -> Tensor:
+    """:func:`display_error` of the estimates ``lit(2 seed)`` and ``lit(2 seed + 1)``, which has no gradient.
+
+    independent: False: the second is the first, so that the gradient is that of the returned value, for tests.
+    """
+    other = image = lit(2 * seed)
+    if independent:
+        with torch.no_grad():
+            other = lit(2 * seed + 1)
+    return display_error(image, other, target, target > SATURATED_LINEAR)
 
 
 def agreement(color: Tensor, weight: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from reli3d._bridge import present
 from reli3d.fit import losses
 from reli3d.fit.bounce import reflected
 from reli3d.fit.budget import Budget
-from reli3d.fit.input_images import SATURATED_LINEAR, InputImages
+from reli3d.fit.input_images import InputImages
 from reli3d.fit.lighting import Lights, radiance
 from reli3d.fit.unknowns import Start, Unknowns, bent, material_change, material_logits, material_of
 from reli3d.geometry.hits import interpolate
@@ -111,7 +111,7 @@ def maps_loss(
     """Loss of one step over ``rows`` of the pixels; gradients reach material, detail, bend, light and exposure.
 
     scene, samples: of :func:`~reli3d.fit.lighting.radiance`.  seed: of the light samples.  independent: as in
-    :func:`~reli3d.fit.shape.shape_loss`.
+    :func:`~reli3d.fit.losses.estimated_error`.
     """
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
     detail = sample_texture(unknowns.detail, pixels.uv[rows])
@@ -120,18 +120,13 @@ def maps_loss(
     normal, turned = bent(unknowns, position, pixels.normal[rows])
     points = SurfacePoints(position, pixels.ng[rows], normal, *material_of(pixels.logits[rows] + change))
     lights, exposure = Lights.of(unknowns, data.start, data.images), unknowns.exposure.exp()[view, None]
+    bounced = reflected(points, pixels.received[rows])
 
     def lit(seed: int) -> Tensor:
         shading = partial(radiance, samples=samples, scene=scene, seed=seed)
-        return lights.evaluate(points, pixels.wo[rows], view, shading)
+        return (bounced + lights.evaluate(points, pixels.wo[rows], view, shading)) * exposure
 
-    bounced = reflected(points, pixels.received[rows])
-    image = (bounced + lit(2 * seed)) * exposure
-    other = image
-    if independent:
-        with torch.no_grad():
-            other = (bounced + lit(2 * seed + 1)) * exposure
-    loss = weights.image * losses.display_error(image, other, target, target > SATURATED_LINEAR)
+    loss = weights.image * losses.estimated_error(lit, target, seed, independent)
     colors = points.base_color, material_of(pixels.logits[rows])[0]
     color, was = (c.clamp(min=losses.MIN_LINEAR).log() for c in colors)
     loss = loss + weights.palette * losses.palette(color, target) + weights.hue * losses.hue_drift(color, was)

@@ -135,14 +135,12 @@ def refine(
     first = with_neutral_light(first, options.light_chromaticity)
     notes: list[str] = []
     if images.light_moves:
-        notes.append("refinement: the lighting moves with the camera; the environment is that of view 0")
+        notes.append("the lighting moves with the camera; the environment is that of view 0")
     elif len(set(images.light_group)) > 1:
-        notes.append(f"refinement: {len(set(images.light_group))} lightings; the environment is that of view 0")
+        notes.append(f"{len(set(images.light_group))} lightings; the environment is that of view 0")
     elif light_follows_camera(first.mesh, near):
-        notes.append(
-            "refinement: brightness varies with the camera; if the lighting moves with it (turntable, flash), "
-            "set light to camera"
-        )
+        advice = "if the lighting moves with it (turntable, flash), set light to camera"
+        notes.append(f"brightness varies with the camera; {advice}")
     with torch.random.fork_rng(devices=[]):
         start = Start.of(first, c2w=near.camera.c2w[used] if images.light_moves else None)
         data = FixedSurface(start, first, received, near, used)
@@ -151,15 +149,15 @@ def refine(
     if budget.bar is not None:
         budget.bar.close()
     if budget.interrupted:
-        notes.append("refinement: interrupted, the best result so far is kept")
-    notes.append(f"refinement: {parts}")
+        notes.append("interrupted, the best result so far is kept")
+    lines = tuple(f"refinement: {note}" for note in (*notes, parts))
     back, c2w = (-scale * shift, 1.0 / scale), views.c2w
     if parts == UNCHANGED:
         kept, after = asset, before
     else:
         kept, c2w = _moved(kept, *back), fitted.images.moved(*back).camera.c2w
     was, now = ((mean_psnr(e[used]), mean_psnr(e[list(held)])) for e in (before, after))
-    return Refinement(kept, parts, was, now, held, c2w, tuple(notes), budget.curve, budget.counts)
+    return Refinement(kept, parts, was, now, held, c2w, lines, budget.curve, budget.counts)
 
 
 def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: list[str]) -> Fitted:
@@ -177,22 +175,20 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
         fit_shape(unknowns, shape, weights, budget, SHAPE_UNTIL, seed=seed, cameras=options.cameras)
         del shape  # 170 MB of 60 images
         if empty(unknowns.sdf, bound):
-            notes.append(
-                "refinement: the masks do not overlap in space, so only maps and lighting are fitted; run reli3d check"
-            )
+            notes.append("the masks do not overlap in space, so only maps and lighting are fitted; run reli3d check")
         elif budget.counts["shape"]:
             surface = transfer_textures(finished(unknowns.sdf, bound, grid), first, texels)
             images = replace(images, camera=corrected(images.camera, unknowns.pose))
             received = gathered(surface.mesh, images.select(used), seed=seed)
             data = FixedSurface(start, surface, received, images, used)
     else:
-        notes.append("refinement: the surface is not closed, so only maps and lighting are fitted")
+        notes.append("the surface is not closed, so only maps and lighting are fitted")
     surface, held = data.asset, [v for v in range(len(images)) if v not in used]
     if len(images) >= MIN_VIEWS_FOR_TRIALS:
         unknowns, data = best_material_start(unknowns, data, held, weights, budget, seed=seed)
         if data.asset is not surface:
             kind = "metal" if float(data.asset.textures.metallic.mean()) > 0.5 else "nonmetal"
-            notes.append(f"refinement: roughness and metallic are fitted from those of a glossy {kind}")
+            notes.append(f"roughness and metallic are fitted from those of a glossy {kind}")
     fit_maps(unknowns, data, weights, budget, "maps", 1.0, seed=seed)
     return Fitted(first, surface, data.received, start, unknowns, images, data.asset)
 

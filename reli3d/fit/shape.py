@@ -15,7 +15,7 @@ from reli3d.fit.bounce import reflected
 from reli3d.fit.budget import Budget
 from reli3d.fit.facets import flattened
 from reli3d.fit.fields import EvenAdam, blurred_grid
-from reli3d.fit.input_images import SATURATED_LINEAR, InputImages
+from reli3d.fit.input_images import InputImages
 from reli3d.fit.lighting import Lights, radiance
 from reli3d.fit.unknowns import Start, Unknowns, corrected, material_change, material_of, unit
 from reli3d.fit.view_colors import MIN_COVERAGE, display_planes, view_colors, view_weights
@@ -198,8 +198,7 @@ def shape_loss(
     """Loss of one step of the surface fit; gradients reach every part of ``unknowns`` except ``detail``.
 
     progress: progress of the fit in [0, 1].  seed: random seed of the step's points, views and light samples.
-    independent: use two independent shading estimates, for an unbiased gradient; False, for tests: the gradient of the
-    returned loss.
+    independent: as in :func:`~reli3d.fit.losses.estimated_error`.
     """
     rng = torch.Generator().manual_seed(seed)
     mesh = extracted(unknowns.sdf, data.bound, data.grid)
@@ -255,11 +254,7 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
         shading = partial(radiance, samples=SHADING_SAMPLES, scene=scene, seed=seed)
         return (bounced + lights.evaluate(points, wo, view, shading)) * exposure
 
-    other = image = lit(2 * seed)
-    if independent:
-        with torch.no_grad():
-            other = lit(2 * seed + 1)
-    loss = loss + weights.shading * losses.display_error(image, other, target, target > SATURATED_LINEAR)
+    loss = loss + weights.shading * losses.estimated_error(lit, target, seed, independent)
     # the same ratio of the terms as in the fit of the maps
     logs = points.base_color.clamp(min=losses.MIN_LINEAR).log()
     loss = loss + weights.shading * weights.palette * losses.palette(logs, target)

@@ -57,12 +57,11 @@ def transfer_textures(mesh: Mesh, source: Asset, size: int, *, shape: bool = Fal
     def at_texels(position: Tensor, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:
         face, bary = nearest_hits(source.mesh, position, normal)
         old = surface_points(source.mesh, source.textures, face, bary)
-        if shape:
-            return _maps(old, normal, tangent)
-        bump = old.normal - unit(
-            interpolate(present("mesh.normals", source.mesh.normals), source.mesh.faces, face, bary)
-        )
-        return _maps(replace(old, normal=unit(normal + bump)), normal, tangent)
+        if not shape:
+            normals = present("mesh.normals", source.mesh.normals)
+            bump = old.normal - unit(interpolate(normals, source.mesh.faces, face, bary))
+            old = replace(old, normal=unit(normal + bump))
+        return _maps(old, normal, tangent)
 
     factor = max(1, source.textures.size // size)  # smaller textures are averages
     baked = bake(mesh, factor * size, at_texels, tangents=True)

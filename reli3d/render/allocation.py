@@ -9,18 +9,10 @@ from torch import Tensor
 from reli3d._bridge import full_precision, launch
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import allocation as kernels
+from reli3d.render import shading
 from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints
-from reli3d.render.shading import (
-    DEFAULT,
-    Samples,
-    ShadeOptions,
-    sampling_plan,
-    shade,
-    shaded_arrays,
-    struct_of_light,
-    struct_of_points,
-)
+from reli3d.render.shading import DEFAULT, Samples, ShadeOptions, shade, shaded_arrays
 
 FIRST_PASS_POINTS = 16384  # with one sample of each strategy; the points of the pilot are drawn from these
 PILOT_SAMPLES = 24576  # in total; an image of 512 x 512, half of it covered, takes 8.4 million
@@ -126,13 +118,11 @@ def _draw(
     with its own below the horizon, have weight 1; then a constant integrand has variance 0.
     """
     n, count, device = len(values[0]), 3 * each, values[0].device
-    options = replace(
-        DEFAULT, samples=(each,) * 3, seed=options.seed, antithetic="none", diffuse_model=options.diffuse_model
-    )
-    plan, offsets = sampling_plan(options, scene)
-    light = struct_of_light(environment.radiance.contiguous(), environment.cdf, offsets.to(device))
+    own = ShadeOptions(samples=(each,) * 3, seed=options.seed, antithetic="none", diffuse_model=options.diffuse_model)
+    plan, offsets = shading.sampling_plan(own, scene)
+    light = shading.struct_of_light(environment.radiance.contiguous(), environment.cdf, offsets.to(device))
     pixels = torch.arange(n, dtype=torch.int32, device=device)
-    ins = [struct_of_points([v.contiguous() for v in values], pixels), light, plan]
+    ins = [shading.struct_of_points([v.contiguous() for v in values], pixels), light, plan]
     origins, directions, value, density = (
         torch.empty(n, count, 3, device=device, dtype=torch.float32) for _ in range(4)
     )

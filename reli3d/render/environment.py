@@ -11,18 +11,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import (
-    SLICE_MIN,
-    Movable,
-    check,
-    empty,
-    full_precision,
-    launch,
-    once_differentiable,
-    over_slices,
-    slices,
-    tensor_of,
-)
+from reli3d import _bridge
+from reli3d._bridge import Movable, check, empty, full_precision, launch, tensor_of
 from reli3d.kernels import envmap as kernels
 from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 
@@ -178,14 +168,14 @@ class _Lookup(torch.autograd.Function):
         return out
 
     @staticmethod
-    @once_differentiable
+    @_bridge.once_differentiable
     def backward(ctx, g_out: Tensor):
         radiance, directions = ctx.saved_tensors
         n, device, needed = directions.shape[0], directions.device, ctx.needs_input_grad
         height, width = radiance.shape[:2]
         # a slice's own accumulator must not cost more than its lookups; on CUDA one launch for all
-        least = max(SLICE_MIN, height * width) if device.type == "cpu" else n + 1
-        parts = len(slices(n, least))
+        least = max(_bridge.SLICE_MIN, height * width) if device.type == "cpu" else n + 1
+        parts = len(_bridge.slices(n, least))
         g_radiance = torch.zeros(parts, height if needed[0] else 0, width, 3, device=device, dtype=torch.float32)
         g_directions = torch.empty(n if needed[1] else 0, 3, device=device, dtype=torch.float32)
         ins = [radiance, directions, g_out.contiguous()]
@@ -194,7 +184,7 @@ class _Lookup(torch.autograd.Function):
             outs = [g_radiance[k], g_directions]
             launch(kernels.lookup_adjoint_kernel, count, [start, *ins, *outs], device, slice_min=count)
 
-        over_slices(n, work, slice_min=least)
+        _bridge.over_slices(n, work, slice_min=least)
         return g_radiance.sum(0) if needed[0] else None, g_directions if needed[1] else None
 
 

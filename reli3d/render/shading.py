@@ -13,20 +13,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import (
-    SLICE_MIN,
-    check,
-    empty,
-    expect,
-    launch,
-    once_differentiable,
-    over_slices,
-    present,
-    slice_of_accumulators,
-    slices,
-    struct_of,
-    view,
-)
+from reli3d import _bridge
+from reli3d._bridge import check, empty, expect, launch, present, struct_of, view
 from reli3d.geometry import embree
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import shade as kernels
@@ -170,19 +158,19 @@ class _Shade(torch.autograd.Function):
         return out
 
     @staticmethod
-    @once_differentiable
+    @_bridge.once_differentiable
     def backward(ctx, g_out: Tensor):
         from reli3d.kernels import shade_adjoint as adjoint  # lazily: an image needs no gradient
 
         *tensors, visible = ctx.saved_tensors
         n, device, needed = g_out.shape[0], g_out.device, ctx.needs_input_grad[1:]
-        least = slice_of_accumulators(n, SLICE_MIN, tensors[7].numel() if needed[7] else 0)
+        least = _bridge.slice_of_accumulators(n, _bridge.SLICE_MIN, tensors[7].numel() if needed[7] else 0)
         least = least if device.type == "cpu" else n + 1  # on CUDA one launch for all
         # gradients that are not needed have no rows, and the kernel skips them
         g_normal, g_base, g_alpha, g_metallic, texels = (
             torch.zeros_like(tensors[k] if needed[k] else tensors[k][:0]) for k in (1, 4, 5, 6, 7)
         )
-        g_radiance = texels.repeat(len(slices(n, least)), 1, 1, 1)  # of each slice
+        g_radiance = texels.repeat(len(_bridge.slices(n, least)), 1, 1, 1)  # of each slice
         ins = [*_inputs(tensors, ctx.job), ctx.job.plan, visible, g_out.contiguous()]
         outs = [g_normal, g_base, g_alpha, g_metallic]
 
@@ -191,7 +179,7 @@ class _Shade(torch.autograd.Function):
             launch(adjoint.shade_adjoint_kernel, length, args, device, slice_min=length)  # stays in its thread
 
         if ctx.job.count:
-            over_slices(n, work, slice_min=least)
+            _bridge.over_slices(n, work, slice_min=least)
         grads = [None, g_normal, None, None, g_base, g_alpha, g_metallic, g_radiance.sum(0), None]
         return None, *(g if w else None for g, w in zip(grads, needed, strict=True))
 
@@ -236,7 +224,7 @@ def _shade_embree(n: int, ins: list, job: _Job, out: Tensor, visible: Tensor) ->
             launch(halves.accumulate_kernel, -(-hits // group), args, out.device)
 
     if n:
-        over_slices(n, work)
+        _bridge.over_slices(n, work)
 
 
 def shaded_arrays(
