@@ -57,10 +57,8 @@ def patches(asset) -> float:
 
 def test_waves_of_the_normals_are_baked_into_the_base_color_less(start, images):
     # the true base color is uniform; the large weights disable the bend
-    free, unbent = (
-        patches(changed(start, fitted(start, images, weights)))
-        for weights in (Weights(palette=0.0), Weights(palette=0.0, free_bend=1e6, bend=1e6))
-    )
+    options = Weights(palette=0.0), Weights(palette=0.0, free_bend=1e6, bend=1e6)
+    free, unbent = (patches(changed(start, fitted(start, images, weights))) for weights in options)
     assert free < 0.9 * unbent
 
 
@@ -73,10 +71,8 @@ def hue(asset) -> torch.Tensor:
 def test_a_light_of_another_color_leaves_the_hue_of_the_base_color(start, images):
     # the start's base color has the true hue; its light is yellow, that of the images blue
     other = replace(start, environment=Environment(start.environment.radiance * torch.tensor([1.6, 1.0, 0.5])))
-    held, free = (
-        float((hue(changed(other, fitted(other, images, weights))) - hue(start)).norm())
-        for weights in (Weights(), Weights(hue=0.0))
-    )
+    results = (changed(other, fitted(other, images, weights)) for weights in (Weights(), Weights(hue=0.0)))
+    held, free = (float((hue(result) - hue(start)).norm()) for result in results)
     assert held < 0.5 * free
 
 

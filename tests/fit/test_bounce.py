@@ -64,11 +64,9 @@ def test_a_convex_body_receives_nothing_and_a_closed_box_one_color(device):
     ball = mesh_from(trimesh.creation.icosphere(3), device)
     vertices = ball.vertices
     outside, inside = replace(ball, normals=vertices), Mesh(vertices, ball.faces.flip(1), -vertices)
-    inputs = images((0.0, 0.0, 0.2), device)
     assert not gathered(outside, images((0.0, 0.0, 4.0), device), seed=0).any()
-    torch.testing.assert_close(
-        gathered(inside, inputs, seed=0), COLOR.to(device).expand(len(vertices), 3), rtol=1e-3, atol=0.0
-    )
+    got = gathered(inside, images((0.0, 0.0, 0.2), device), seed=0)
+    torch.testing.assert_close(got, COLOR.to(device).expand(len(vertices), 3), rtol=1e-3, atol=0.0)
 
 
 def test_where_no_camera_sees_anything_nothing_is_received(device):

@@ -169,9 +169,8 @@ def test_the_relative_plan_is_for_visible_points(device):
     arguments, env = surface(device, 0.3, 1.0), light("sun", device)
     metallic = torch.arange(24, device=device) % 2 * 1.0
     arguments = (*arguments[:5], 1.0 - 0.7 * metallic, metallic)
-    plans = [
-        plan_samples(*at(*arguments), env, relative=r, options=ShadeOptions(sequence="random")) for r in (False, True)
-    ]
+    options = ShadeOptions(sequence="random")
+    plans = [plan_samples(*at(*arguments), env, relative=relative, options=options) for relative in (False, True)]
     runs = [runs_of(arguments, env, p.samples, sequence="random", antithetic="none") for p in plans]
     mean = torch.cat(runs).mean((0, 2))
     scale = 1.0 / (mean.square() + (0.1 * mean.mean()) ** 2)

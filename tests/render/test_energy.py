@@ -141,13 +141,8 @@ def test_partly_metallic_white_loses_no_more_than_its_parts(device):
     assert abs(float(fraction.sum()) - 1.0) < 1e-6
 
     def sent(metallic):
-        value = eval_bsdf(
-            wo.float().to(device),
-            torch.ones(3, device=device),
-            torch.tensor(0.09, device=device),
-            torch.tensor(metallic, device=device),
-            wi.float().to(device),
-        )
+        values = wo.float(), torch.ones(3), torch.tensor(0.09), torch.tensor(metallic), wi.float()
+        value = eval_bsdf(*(v.to(device) for v in values))
         return float((value[:, 0].double().cpu() * fraction).sum() * torch.pi)
 
     got = [sent(m) for m in METALLIC]

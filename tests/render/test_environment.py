@@ -107,12 +107,8 @@ def test_samples_fall_on_texels_by_their_density(device, name):
     off = [(v * n - (v * n).round()).abs() for v, n in ((down, height), (across, width))]
     inner = (off[0] > 1e-4) & (off[1] > 1e-4)  # of a texel; float32 angles are 1e-5 of one, a border's side is a toss
     assert ((env.pdf(d) / pdf - 1).abs() < 1e-5)[inner].all() and float(inner.float().mean()) > 0.99
-    y, x = torch.meshgrid(
-        (torch.arange(height, device=device) + 0.5) / height,
-        (torch.arange(width, device=device) + 0.5) / width,
-        indexing="ij",
-    )
-    centers = grid.at(y.reshape(-1).double(), x.reshape(-1).double())[0].float()
+    y, x = ((torch.arange(n, device=device) + 0.5) / n for n in (height, width))
+    centers = grid.at(y.repeat_interleave(width).double(), x.repeat(height).double())[0].float()
     assert torch.equal(env.pdf(centers).reshape(height, width), env.cdf.density)  # exactly 0 where nothing is lit
 
 

@@ -53,16 +53,13 @@ def test_values_that_are_not_finite_give_nan_in_their_row_only(device, name, val
     values = dict(position=0.3 * normal, ng=normal, normal=normal, **finish, wo=wo)
     broken = {k: v.clone() for k, v in values.items()}
     broken[name][7].fill_(value) if broken[name].ndim == 1 else broken[name][7, 1:2].fill_(value)
-    calls = [
-        lambda p, wo, s=s: shade(p, wo, light, scene=s)
-        for s in (None, shadow_caster(device), shadow_caster(device, "warp"))
-    ]
+    scenes = None, shadow_caster(device), shadow_caster(device, "warp")
+    calls = [lambda p, wo, s=s: shade(p, wo, light, scene=s) for s in scenes]
     if name not in ("position", "ng"):  # which play no part in it
         calls += [lambda p, wo: shade_gaussians(p, wo, lobe)]
     for call in calls:
-        expected, got = (
-            call(SurfacePoints(**{k: v for k, v in rows.items() if k != "wo"}), rows["wo"]) for rows in (values, broken)
-        )
+        (*whole, wo), (*parts, bad_wo) = values.values(), broken.values()
+        expected, got = call(SurfacePoints(*whole), wo), call(SurfacePoints(*parts), bad_wo)
         assert bool(expected.isfinite().all()) and bool(got[7].isnan().all())
         rest = torch.arange(40, device=device) != 7
         assert torch.equal(got[rest], expected[rest])
@@ -72,9 +69,8 @@ def test_directions_and_ranges_are_checked_on_request(device):
     normal, wo = (v.to(device) for v in points(30))
     light, requested = Environment(sky().radiance.to(device)), ShadeOptions(check_inputs=True)
     good = dict(position=normal, ng=normal, normal=normal, base_color=normal.abs(), roughness=0.5, metallic=1.0)
-    assert torch.equal(
-        shade(SurfacePoints(**good), wo, light, options=requested), shade(SurfacePoints(**good), wo, light)
-    )
+    valid = SurfacePoints(**good)
+    assert torch.equal(shade(valid, wo, light, options=requested), shade(valid, wo, light))
     for name, value in (
         ("normal", 1.01 * normal),
         ("ng", 0.0 * normal),
@@ -87,10 +83,6 @@ def test_directions_and_ranges_are_checked_on_request(device):
         with pytest.raises(ValueError, match=f"^{name}: expected .* in row 0$"):
             shade(wrong, wo, light, options=requested)
         shade(wrong, wo, light)  # else it goes into the formulas as it is
+    wo[3] *= 2.0
     with pytest.raises(ValueError, match="^wo: expected unit vectors, got .* in row 3$"):
-        shade(
-            SurfacePoints(**good),
-            torch.where(torch.arange(30, device=device)[:, None] == 3, 2.0, 1.0) * wo,
-            light,
-            options=requested,
-        )
+        shade(valid, wo, light, options=requested)

@@ -124,13 +124,8 @@ def test_bad_input_is_named(device):
 def gradient_inputs(device, n=400):
     normal, wo = points(n, seed=4)
     g = torch.Generator().manual_seed(9)
-    values = [
-        normal,
-        0.1 + 0.8 * torch.rand(n, 3, generator=g),
-        0.3 + 0.6 * torch.rand(n, generator=g),
-        torch.rand(n, generator=g),
-        sky(8).radiance,
-    ]
+    base, rough = 0.1 + 0.8 * torch.rand(n, 3, generator=g), 0.3 + 0.6 * torch.rand(n, generator=g)
+    values = (normal, base, rough, torch.rand(n, generator=g), sky(8).radiance)
     return wo.to(device), [v.to(device).requires_grad_() for v in values]
 
 

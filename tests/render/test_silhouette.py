@@ -70,12 +70,9 @@ def coverage(points, camera, factor=12):
     return inside.reshape(camera.height, factor, camera.width, factor).mean((1, 3))
 
 
-MOVES = {
-    "x": lambda v: torch.tensor([1.0, 0, 0]).expand_as(v),
-    "y": lambda v: torch.tensor([0.0, 1, 0]).expand_as(v),
-    "z": lambda v: torch.tensor([0.0, 0, 1]).expand_as(v),
-    "scale": lambda v: v.cpu(),
-}
+def moves(points):
+    """Shifts along the axes and growth, ``(V, 3)`` float64."""
+    return [*np.broadcast_to(np.eye(3)[:, None], (3, *points.shape)), points]
 
 
 @pytest.mark.parametrize("name", ["sphere", "fine sphere", "cube"])
@@ -88,9 +85,8 @@ def test_area_and_its_gradient_are_those_of_the_projected_outline(device, name):
     _, area = outline(points, camera)
     assert abs(float(mask.detach().sum()) / area - 1.0) < 0.002  # midpoint rule; corners err by part of a pixel
     (g,) = torch.autograd.grad(mask.sum(), vertices)
-    for move in MOVES.values():
-        d = move(vertices.detach()).double().numpy()
-        h = 1e-4
+    h = 1e-4
+    for d in moves(points):
         expected = (outline(points + h * d, camera)[1] - outline(points - h * d, camera)[1]) / (2 * h)
         got = float((g.cpu().double().numpy() * d).sum())
         # edges near 45 degrees take turns in rows and columns, which adds or drops part of a pixel of the 90 at each
@@ -109,15 +105,13 @@ def test_mask_loss_gradient_matches_differences_of_sampled_coverage(device, name
     assert float((mask.detach().cpu() - torch.tensor(coverage(points, camera))).abs().mean()) < 2e-3  # of 0 to 1
     aim = torch.tensor(target, dtype=torch.float32, device=device)
     (g,) = torch.autograd.grad((mask - aim).square().sum(), vertices)
-    largest = 0.0
-    for key in ("x", "y", "z", "scale"):
-        d = MOVES[key](vertices.detach()).double().numpy()
-        h = 0.02  # half a pixel: the sampled coverage is smooth over that
+    largest, h = 0.0, 0.02  # half a pixel: the sampled coverage is smooth over that
+    for k, d in enumerate(moves(points)):
         up, down = (((coverage(points + s * h * d, camera) - target) ** 2).sum() for s in (1, -1))
         got, expected = float((g.cpu().double().numpy() * d).sum()), (up - down) / (2 * h)
         largest = max(largest, abs(expected))
         # an oblique edge changes two pixels of a row, its crossing one, so squares of pixels weigh more: 8 to 14 %
-        assert abs(got - expected) < 0.15 * largest, key
+        assert abs(got - expected) < 0.15 * largest, k
 
 
 def test_hidden_outlines_do_not_move_and_colors_blend_between_neighbors(device):

