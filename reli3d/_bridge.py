@@ -225,16 +225,16 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
     _check_device(args, device)
     with stream(device) as name:
         values = _views(args, _element_types(kernel))
-        if name != "cpu":
-            wp.launch(kernel, n, [0, *values], device=name)
-            return
-        _load(kernel)
-        if serial():
-            wp.launch(kernel, n, [0, *values], device="cpu")
-            return
-        over_slices(
-            n, lambda k, start, count: wp.launch(kernel, count, [start, *values], device="cpu"), slice_min=slice_min
-        )
+
+        def work(_, start, count):
+            wp.launch(kernel, count, [start, *values], device=name)
+
+        if name == "cpu":
+            _load(kernel)
+        if name != "cpu" or serial():
+            work(0, 0, n)
+        else:
+            over_slices(n, work, slice_min=slice_min)
 
 
 class _Once(torch.autograd.Function):

@@ -14,7 +14,7 @@ from torch.nn.functional import embedding_bag, normalize
 
 from reli3d import _bridge
 from reli3d._bridge import check, expect, struct_of
-from reli3d.geometry.mesh import Mesh, sorted_keys, vertex_normals
+from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.topology import edges_of
 from reli3d.kernels import bake as kernels
 
@@ -63,11 +63,11 @@ def _bins(lower: Tensor, upper: Tensor, size: int, tile: int) -> tuple[Tensor, T
     local = torch.arange(len(item), device=item.device, dtype=torch.int64) - (torch.cumsum(count, 0) - count)[item]
     wide = extent[:, 0][item]
     tile_of = (first[:, 1][item] + local // wide) * tiles + first[:, 0][item] + local % wide
-    order = sorted_keys(tile_of * len(lower) + item)
-    start = torch.searchsorted(
-        order, torch.arange(tiles * tiles + 1, device=item.device, dtype=torch.int64) * max(len(lower), 1)
-    )
-    return start.to(torch.int32), (order % max(len(lower), 1)).to(torch.int32)
+    keys, boxes = tile_of * len(lower) + item, max(len(lower), 1)
+    # numpy's vector sort is 5 times faster than torch's, which carries indices
+    order = torch.sort(keys).values if keys.is_cuda else torch.from_numpy(np.sort(keys.numpy()))
+    edges = torch.arange(tiles * tiles + 1, device=item.device, dtype=torch.int64) * boxes
+    return torch.searchsorted(order, edges).to(torch.int32), (order % boxes).to(torch.int32)
 
 
 def rasterize_texels(mesh: Mesh, size: int) -> Texels:

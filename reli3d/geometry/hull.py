@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check, launch
+from reli3d._bridge import check, launch, struct_of
 from reli3d.geometry.camera import Camera, check_camera
 from reli3d.kernels import hull as kernels
 
@@ -58,8 +58,7 @@ def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: floa
     if not far >= 0.0:
         raise ValueError(f"far: expected at least 0, got {far}")
     hull = torch.empty(len(points), device=points.device, dtype=torch.float32)
-    inputs = [points.detach().contiguous(), *views, far, hull]
-    launch(kernels.hull_distance_kernel, len(points), inputs, points.device)
+    launch(kernels.hull_distance_kernel, len(points), [points.detach().contiguous(), views, far, hull], points.device)
     return hull
 
 
@@ -92,9 +91,8 @@ def mirror_residual(
         raise ValueError(f"most: expected at least 0, got {most}")
     views = _views(points, distance, camera)
     residual = points.new_empty(len(normal), len(points))
-    rays = [points.detach().contiguous(), known.contiguous()]
-    planes = [normal.detach().contiguous(), offset.detach().contiguous()]
-    inputs = [*rays, *planes, float(most), *views, residual]
+    arrays = [v.detach().contiguous() for v in (points, known, normal, offset)]
+    inputs = [*arrays, float(most), views, residual]
     launch(kernels.mirror_residual_kernel, residual.numel(), inputs, points.device)
     return residual
 
@@ -117,15 +115,15 @@ def hull_span(origins: Tensor, directions: Tensor, radius: float, distance: Tens
     views = _views(origins, distance, camera)
     span = torch.empty(len(origins), 2, device=origins.device, dtype=torch.float32)
     rays = [v.detach().contiguous() for v in (origins, directions)]
-    inputs = [*rays, float(radius), *views, span]
-    launch(kernels.hull_span_kernel, len(origins), inputs, origins.device)
+    launch(kernels.hull_span_kernel, len(origins), [*rays, float(radius), views, span], origins.device)
     return span
 
 
-def _views(points: Tensor, distance: Tensor, camera: Camera) -> list[Tensor]:
-    """The kernels' arguments of the views, checked."""
+def _views(points: Tensor, distance: Tensor, camera: Camera) -> kernels.Views:
+    """The views, checked."""
     check("distance", distance, like=points)
     if distance.ndim != 3 or min(distance.shape[1:]) < 2:
         raise ValueError(f"distance: expected shape (V, H, W) with H and W above 1, got {tuple(distance.shape)}")
     check_camera(camera, like=points, views=len(distance), size=distance.shape[1:])
-    return [value.detach().contiguous() for value in (distance, camera.c2w, camera.intrinsics)]
+    arrays = {"distance": distance, "c2w": camera.c2w, "intrinsics": camera.intrinsics}
+    return struct_of(kernels.Views, **{name: value.detach().contiguous() for name, value in arrays.items()})

@@ -15,11 +15,7 @@ from reli3d.kernels.flexicubes import SDF_MIN
 
 
 def vertex_deviation(
-    sdf: Tensor,
-    *,
-    radius: float | Sequence[float],
-    weights: CubeWeights = UNIT_WEIGHTS,
-    closed: bool = True,
+    sdf: Tensor, *, radius: float | Sequence[float], weights: CubeWeights = UNIT_WEIGHTS, closed: bool = True
 ) -> Tensor:
     """L_dev ``(D,)`` of the dual vertices, in units of ``radius``; the mean is the loss.
 

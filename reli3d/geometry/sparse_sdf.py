@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool3d
 
 INSIDE_DEPTH = 0.2  # a coarse cell (two grid cells a side) with all corners below -INSIDE_DEPTH is not refined
 
@@ -39,9 +40,10 @@ def sparse_sdf(known: Tensor, near: Tensor, evaluate: Callable[[Tensor], Tensor]
     every_other = torch.zeros_like(near)
     every_other[::2, ::2, ::2] = near[::2, ::2, ::2]
     evaluate_at(every_other)
-    deep = _all_corners(sdf[::2, ::2, ::2] < -INSIDE_DEPTH)
+    shallow = (~(sdf[::2, ::2, ::2] < -INSIDE_DEPTH)).float()
+    cells = max_pool3d(shallow[None], 2, 1)[0] > 0.0  # coarse cells with a corner that is not deep, or NaN
     inside = torch.zeros_like(near)
-    inside[tuple(slice(2 * n + 1) for n in deep.shape)] = ~_points_of(~deep)
+    inside[tuple(slice(2 * n + 1) for n in cells.shape)] = ~_points_of(cells)
     inside &= near & ~done
     sdf[inside] = -INSIDE_DEPTH
     evaluate_at(near & ~done & ~inside)
@@ -50,13 +52,6 @@ def sparse_sdf(known: Tensor, near: Tensor, evaluate: Callable[[Tensor], Tensor]
         if not bool(across.any()):
             return sdf
         evaluate_at(across)
-
-
-def _all_corners(points: Tensor) -> Tensor:
-    """``(X - 1, Y - 1, Z - 1)`` cells whose eight corners are all true."""
-    for axis, count in enumerate(points.shape):
-        points = points.narrow(axis, 0, count - 1) & points.narrow(axis, 1, count - 1)
-    return points
 
 
 def _points_of(cells: Tensor) -> Tensor:

@@ -55,6 +55,12 @@ class _Topology:
     slot: Tensor  # (vertices of the grid,) surface cube of a cell; undefined elsewhere
 
     @cached_property
+    def owner(self) -> Tensor:
+        """Surface cube ``(D,)`` of every dual vertex."""
+        counts, order = self.counts.long(), torch.argsort(self.base)
+        return torch.repeat_interleave(order, counts[order])
+
+    @cached_property
     def surface(self) -> kernels.SurfaceCubes:
         names = ("cells", "rows", "resolved", "counts", "base", "slot")
         return struct_of(kernels.SurfaceCubes, **{name: getattr(self, name) for name in names})
@@ -221,10 +227,8 @@ class _DualVertices(torch.autograd.Function):
     @staticmethod
     def forward(ctx, topology, scale, padded, sdf, deformation, alpha, beta):
         t, device = topology, sdf.device
-        counts = t.counts.long()
-        order = torch.argsort(t.base)
-        cube = torch.repeat_interleave(order, counts[order]).to(torch.int32)
-        group = torch.arange(len(cube), dtype=torch.int32, device=device) - t.base[cube.long()]
+        cube = t.owner.to(torch.int32)
+        group = torch.arange(len(cube), dtype=torch.int32, device=device) - t.base[t.owner]
         vertices = torch.empty(len(cube), 3, device=device, dtype=torch.float32)
         inputs = [None if v is None else v.detach().contiguous() for v in (deformation, alpha, beta)]
         arguments = [cube, group, *_DualVertices.arguments(t, padded, inputs, scale), vertices]
@@ -297,13 +301,7 @@ def _quads(t: _Topology, padded: Tensor, crossed: Tensor, gamma: Tensor | None) 
 
 def _gamma_of(t: _Topology, quads: Tensor, gamma: Tensor) -> Tensor:
     """Gamma of the cubes of every quad, ``(Q, 4)``, with its gradient; 1 in the padding."""
-    rows = torch.repeat_interleave(t.rows.long(), t.counts.long())
-    first = torch.repeat_interleave(t.base.long(), t.counts.long())
-    inner = torch.arange(len(first), device=first.device, dtype=torch.int64)
-    inner = inner - torch.repeat_interleave(torch.cumsum(t.counts.long(), 0) - t.counts, t.counts.long())
-    row_of = torch.empty_like(rows)
-    row_of[first + inner] = rows
-    rows = row_of[quads.long()]
+    rows = t.rows.long()[t.owner[quads.long()]]
     return torch.where(rows >= 0, gamma.index_select(0, rows.clamp(min=0).view(-1)).view_as(rows), 1.0)
 
 

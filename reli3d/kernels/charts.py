@@ -225,9 +225,7 @@ def cuts_kernel(
     start: int,
     along: wp.array[vec8d],  # (P,) border points of the charts, one chart after the other, along the directions
     begin: wp.array[wp.int32],  # (C + 1,) of the charts' points
-    at: wp.array3d[
-        wp.float64
-    ],  # out: (C, 8, 2) places of the cuts across a direction: the middle, and the points' mean
+    at: wp.array3d[wp.float64],  # out: (C, 8, 2) places of the cuts across a direction: the middle, the points' mean
     area: wp.array3d[wp.float64],  # out: (C, 8, 2) of the smallest boxes of both pieces
 ):
     i = start + wp.tid()

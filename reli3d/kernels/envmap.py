@@ -71,12 +71,6 @@ def add_texels(g_radiance: wp.array2d[wp.vec3], uv: wp.vec2, g: wp.vec3):
 
 
 @wp.func
-def lookup_envmap(radiance: wp.array2d[wp.vec3], d: wp.vec3) -> wp.vec3:
-    """Bilinear radiance from the unit direction ``d``."""
-    return lookup_envmap_uv(radiance, direction_to_uv(d))
-
-
-@wp.func
 def upper_cell(cdf: wp.array2d[float], guide: wp.array2d[wp.int32], row: int, u: float) -> int:
     """Index k with ``cdf[row, k] <= u < cdf[row, k + 1]``; such a cell has positive probability.
 
@@ -152,7 +146,7 @@ def lookup_envmap_kernel(
     out: wp.array[wp.vec3],  # out
 ):
     i = start + wp.tid()
-    out[i] = lookup_envmap(radiance, directions[i])
+    out[i] = lookup_envmap_uv(radiance, direction_to_uv(directions[i]))
 
 
 @wp.kernel

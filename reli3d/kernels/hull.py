@@ -27,27 +27,32 @@ EXACT_PIXELS = wp.constant(4.0)  # beyond, other segments are at most sqrt(16.5)
 SEGMENT_PIXELS = wp.constant(16.0)  # beyond, the end of a segment is at most 0.25 / 16 pixels farther than the segment
 
 
+@wp.struct
+class Views:
+    """Silhouette distances ``(V, H, W)`` and the cameras of the V views."""
+
+    distance: wp.array3d[float]
+    c2w: wp.array[wp.mat44]
+    intrinsics: wp.array[wp.vec4]
+
+
 @wp.func
-def distance_in_view(
-    point: wp.vec3, view: int, distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4]
-) -> float:
+def distance_in_view(point: wp.vec3, view: int, views: Views) -> float:
     """Silhouette distance where a point projects, times the size of a pixel at its depth."""
-    k = intrinsics[view]
-    q = project_point(point, c2w[view], k)
+    k = views.intrinsics[view]
+    q = project_point(point, views.c2w[view], k)
     if q[2] > DEPTH_MIN:  # False for NaN too
-        return look_up(distance, view, q[0], q[1]) * q[2] * 2.0 / (k[0] + k[1])
+        return look_up(views.distance, view, q[0], q[1]) * q[2] * 2.0 / (k[0] + k[1])
     return BEHIND
 
 
 @wp.func
-def distance_to_hull(
-    point: wp.vec3, distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4], far: float
-) -> float:
+def distance_to_hull(point: wp.vec3, views: Views, far: float) -> float:
     """Minimum of :func:`distance_in_view` over the views; stops at the first view below ``-far``."""
     best = wp.float32(-BEHIND)
     view = wp.int32(0)
-    while view < c2w.shape[0] and best >= -far:
-        best = wp.min(best, distance_in_view(point, view, distance, c2w, intrinsics))
+    while view < views.c2w.shape[0] and best >= -far:
+        best = wp.min(best, distance_in_view(point, view, views))
         view += 1
     return best
 
@@ -56,14 +61,12 @@ def distance_to_hull(
 def hull_distance_kernel(
     start: int,
     points: wp.array[wp.vec3],
-    distance: wp.array3d[float],
-    c2w: wp.array[wp.mat44],
-    intrinsics: wp.array[wp.vec4],
+    views: Views,
     far: float,
     hull: wp.array[float],  # out
 ):
     i = start + wp.tid()
-    hull[i] = distance_to_hull(points[i], distance, c2w, intrinsics, far)
+    hull[i] = distance_to_hull(points[i], views, far)
 
 
 @wp.kernel
@@ -74,9 +77,7 @@ def mirror_residual_kernel(
     normal: wp.array[wp.vec3],  # (P,) of planes, unit
     offset: wp.array[float],  # (P,)
     most: float,
-    distance: wp.array3d[float],
-    c2w: wp.array[wp.mat44],
-    intrinsics: wp.array[wp.vec4],
+    views: Views,
     residual: wp.array2d[float],  # out: (P, R)
 ):
     """Least distance outside the hull of the mirror images of a ray's known points, at most ``most``."""
@@ -90,22 +91,13 @@ def mirror_residual_kernel(
         if known[ray, k]:
             p = points[ray, k]
             mirrored = p - 2.0 * (wp.dot(n, p) - offset[plane]) * n
-            best = wp.max(best, distance_to_hull(mirrored, distance, c2w, intrinsics, -best))
+            best = wp.max(best, distance_to_hull(mirrored, views, -best))
         k += 1
     residual[plane, ray] = wp.max(-best, 0.0)
 
 
 @wp.func
-def march(
-    o: wp.vec3,
-    d: wp.vec3,
-    begin: float,
-    end: float,
-    least_step: float,
-    distance: wp.array3d[float],
-    c2w: wp.array[wp.mat44],
-    intrinsics: wp.array[wp.vec4],
-):
+def march(o: wp.vec3, d: wp.vec3, begin: float, end: float, least_step: float, views: Views):
     """Whether sphere tracing of ``o + t d`` from ``begin`` to ``end`` hits the hull, and t there or closest to it."""
     sign = wp.where(end < begin, -1.0, 1.0)
     unit = 1.0 / wp.length(d)
@@ -113,7 +105,7 @@ def march(
     nearest = wp.float32(begin)
     best = wp.float32(BEHIND)
     while sign * (end - t) >= 0.0 and best < -REACHED:
-        h = distance_to_hull(o + d * t, distance, c2w, intrinsics, -BEHIND)
+        h = distance_to_hull(o + d * t, views, -BEHIND)
         if h > best:
             best = h
             nearest = t
@@ -127,9 +119,7 @@ def hull_span_kernel(
     origins: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     radius: float,
-    distance: wp.array3d[float],
-    c2w: wp.array[wp.mat44],
-    intrinsics: wp.array[wp.vec4],
+    views: Views,
     span: wp.array[wp.vec2],  # out
 ):
     """Sphere tracing from both ends of a ray's chord in the sphere of ``radius`` around the origin."""
@@ -141,10 +131,10 @@ def hull_span_kernel(
     half = wp.sqrt(wp.max(b * b - a * (wp.dot(o, o) - radius * radius), 0.0)) / a
     low = -b / a - half
     high = -b / a + half
-    hit, first = march(o, d, low, high, LEAST_STEP * high, distance, c2w, intrinsics)
+    hit, first = march(o, d, low, high, LEAST_STEP * high, views)
     last = wp.float32(first)  # of a ray that misses the hull both are its closest approach
     if hit:
-        again, back = march(o, d, high, first, LEAST_STEP * high, distance, c2w, intrinsics)
+        again, back = march(o, d, high, first, LEAST_STEP * high, views)
         if again:
             last = back
     span[i] = wp.vec2(first, last)

@@ -15,7 +15,6 @@ from reli3d.kernels.bsdf import eval_bsdf, pdf_lobes
 from reli3d.kernels.envmap import direction_to_uv, lookup_envmap_uv, pdf_envmap_uv, sample_envmap
 from reli3d.kernels.math import INLINE, tangent_frame
 from reli3d.kernels.microfacet import ALPHA_MIN, COS_MIN, Facet, facet_between, ggx_root, sample_ggx_vndf, stretch_view
-from reli3d.kernels.mis import mis_factor
 from reli3d.kernels.random import random_pair, rotate_point
 from reli3d.kernels.rays import hit_occluded, offset_origin
 from reli3d.kernels.sampling import mirror, opposite, reflect, sample_cosine
@@ -169,6 +168,24 @@ def visible_normal(surface: Surface, plan: Plan, points: wp.array[wp.vec2], k: i
     if how == MIRRORED:
         wm = mirror(wm)
     return wm
+
+
+@wp.func
+def mis_factor(chosen: float, all: wp.vec4, power: int) -> float:
+    """MIS weight (Veach and Guibas 1995) over ``chosen``, the count times density of the strategy that drew the sample.
+
+    all: count times density of every strategy, 0 for unused ones.  Balance heuristic (``power`` 0): 1 / sum(all).
+    Power heuristic with exponent 2: chosen / sum(all**2), normalized by the sum because the squares of narrow lobes
+    overflow float32.  0 if ``chosen`` is 0.
+    """
+    factor = wp.float32(0.0)
+    total = all[0] + all[1] + all[2] + all[3]
+    if chosen > 0.0:
+        factor = 1.0 / total
+        if power != 0:
+            fraction = all / total
+            factor = chosen / total / (wp.dot(fraction, fraction) * total)
+    return factor
 
 
 @wp.func

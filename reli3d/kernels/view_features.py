@@ -246,10 +246,8 @@ def fuse_views_kernel(
     rough_metal: wp.array3d[wp.vec4],  # (V, P, P) confidence, roughness, metallic, gain of the logits minus their mean
     normals: wp.array3d[wp.vec4],  # (V, P, P) normal; 0
     logit: wp.array[wp.vec3],  # out: (N,) of the base color
-    numbers: wp.array2d[
-        float
-    ],  # out: (N, 10): roughness, metallic, gain, normal - mesh normal (3), cosine, max weight,
-    # out:                              confidence, spread
+    numbers: wp.array2d[float],  # out: (N, 10) roughness, metallic, gain, normal - mesh normal (3), cosine, max weight,
+    # confidence, spread
     shading: wp.array[wp.vec3],  # out: (N,) unit normal
 ):
     """Blends the views' predictions, weighted by view_weight**2 * exp(confidence).
