@@ -37,8 +37,7 @@ def vertex_deviation(
     cell, edge = (group >= 0).nonzero(as_tuple=True)
     owner = t.base.long()[cell] + group[cell, edge]
     row = t.rows.long()[cell]
-    corner = surface.corner_vertices(t)
-    step = torch.tensor([t.shape[1] * t.shape[2], t.shape[2], 1], device=device, dtype=torch.int64)
+    corner, padded_corner = surface.corner_vertices(t), surface.corners_of(t.cells, t.shape)
 
     def weight(values: Tensor | None, column: Tensor) -> Tensor:
         if values is None:
@@ -49,17 +48,13 @@ def vertex_deviation(
 
     ends, alphas, positions = [], [], []
     for end in table["ends"].view(12, 2).long()[edge].unbind(1):
-        offset = torch.stack([end & 1, end >> 1 & 1, end >> 2], -1)
-        at_padded = t.cells.long()[cell] + (offset * step).sum(-1)
-        ends.append(padded.reshape(-1).index_select(0, at_padded))
+        ends.append(padded.reshape(-1).index_select(0, padded_corner[cell, end]))
         alphas.append(weight(weights.alpha, end))
         vertex = corner[cell, end]
-        nz = t.cubes[2] + 1
-        at = torch.stack([vertex // ((t.cubes[1] + 1) * nz), vertex // nz % (t.cubes[1] + 1), vertex % nz], -1)
-        position = at / size - 0.5
-        positions.append(
-            position if deformation is None else position + deformation.reshape(-1, 3).index_select(0, vertex)
-        )
+        position = torch.stack(torch.unravel_index(vertex, sdf.shape), -1) / size - 0.5
+        if deformation is not None:
+            position = position + deformation.reshape(-1, 3).index_select(0, vertex)
+        positions.append(position)
     tiny = torch.maximum(*(v.detach().abs() for v in ends)) < SDF_MIN
     # float64 from here on: field values and weights have any magnitude, and distances are differences of positions
     values = [torch.where(tiny, v.detach(), v).double() * a for v, a in zip(ends, alphas, strict=True)]

@@ -65,10 +65,9 @@ class _Topology:
         names = ("cells", "rows", "resolved", "counts", "base", "slot")
         return struct_of(kernels.SurfaceCubes, **{name: getattr(self, name) for name in names})
 
-    def grid(self, sdf: Tensor, shift: Tensor | None) -> kernels.Grid:
-        """The kernels' grid of the padded ``sdf`` and the offsets before padding."""
-        shift = sdf.new_empty(0, 3) if shift is None else shift.view(-1, 3)
-        (_, ny, nz), cubes = self.shape, wp.vec3i(*self.cubes)
+    def grid(self, sdf: Tensor, shift: Tensor) -> kernels.Grid:
+        """The kernels' grid of the padded ``sdf`` and the offsets before padding, of which there may be none."""
+        (_, ny, nz), cubes, shift = self.shape, wp.vec3i(*self.cubes), shift.view(-1, 3)
         return struct_of(kernels.Grid, sdf=sdf.view(-1), shift=shift, ny=ny, nz=nz, cubes=cubes, pad=self.pad)
 
 
@@ -97,10 +96,8 @@ def surface_points(sdf: Tensor, cubes: Tensor) -> tuple[Tensor, Tensor]:
     """The grid vertices on which the surface depends: ascending indices ``(N,)`` in ``sdf.view(-1)``, and the positions
     ``(K, 8)`` in this list of the corners of ``cubes (K,)``, the surface cubes.
     """
-    (y, z), k = sdf.shape[1:], torch.arange(8, device=sdf.device, dtype=torch.int64)
-    i, rest = cubes // ((y - 1) * (z - 1)), cubes % ((y - 1) * (z - 1))
-    lowest = (i * y + rest // (z - 1)) * z + rest % (z - 1)
-    corners = lowest[:, None] + ((k & 1) * y + (k >> 1 & 1)) * z + (k >> 2)
+    i, j, k = torch.unravel_index(cubes, [n - 1 for n in sdf.shape])
+    corners = corners_of((i * sdf.shape[1] + j) * sdf.shape[2] + k, sdf.shape)
     needed = torch.zeros_like(sdf, dtype=torch.bool, memory_format=torch.contiguous_format)
     for side in range(3):  # where the inside reaches the box, the cap uses the vertices of the border
         for end in (0, -1):
@@ -191,8 +188,7 @@ def topology_of(sdf: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topol
         sdf = torch.nn.functional.pad(sdf, (1,) * 6, value=1.0)
     case, crossed = _classify(sdf)
     cells = case.view(-1).nonzero().squeeze(1)
-    _, y, z = sdf.shape
-    i, j, k = cells // (y * z) - pad, cells // z % y - pad, cells % z - pad
+    i, j, k = (index - pad for index in torch.unravel_index(cells, sdf.shape))
     real = (i >= 0) & (j >= 0) & (k >= 0) & (i < size[0]) & (j < size[1]) & (k < size[2])
     rows = torch.where(real, (i * size[1] + j) * size[2] + k, -1)
     if cubes is not None:
@@ -230,19 +226,18 @@ class _DualVertices(torch.autograd.Function):
         cube = t.owner.to(torch.int32)
         group = torch.arange(len(cube), dtype=torch.int32, device=device) - t.base[t.owner]
         vertices = torch.empty(len(cube), 3, device=device, dtype=torch.float32)
-        inputs = [None if v is None else v.detach().contiguous() for v in (deformation, alpha, beta)]
-        arguments = [cube, group, *_DualVertices.arguments(t, padded, inputs, scale), vertices]
+        arguments = [cube, group, *_DualVertices.arguments(t, padded, (deformation, alpha, beta), scale), vertices]
         launch(kernels.dual_vertex_kernel, len(cube), arguments, device)
         ctx.topology, ctx.scale = topology, scale
         ctx.save_for_backward(padded, sdf, deformation, alpha, beta)
         return vertices
 
     @staticmethod
-    def arguments(t: _Topology, padded: Tensor, inputs: list, scale: tuple) -> list:
+    def arguments(t: _Topology, padded: Tensor, given: Sequence[Tensor | None], scale: tuple) -> list:
         none = padded.new_empty(0)
-        alpha, beta = (none if v is None else v.view(-1) for v in inputs[1:])
+        shift, alpha, beta = (none if v is None else v.detach().reshape(-1) for v in given)
         weights = struct_of(kernels.Weights, alpha=alpha, beta=beta)
-        return [t.surface, _struct_of_tables(padded.device), t.grid(padded, inputs[0]), weights, wp.vec3(*scale)]
+        return [t.surface, _struct_of_tables(padded.device), t.grid(padded, shift), weights, wp.vec3(*scale)]
 
     @staticmethod
     @once_differentiable
@@ -251,12 +246,11 @@ class _DualVertices(torch.autograd.Function):
 
         t, device = ctx.topology, g_vertices.device
         padded, sdf, *given = ctx.saved_tensors
-        inputs = [None if v is None else v.contiguous() for v in given]
         n = len(t.cells)
         g_sdf, g_alpha, g_beta = (torch.zeros(n, width, device=device, dtype=torch.float32) for width in (8, 8, 12))
         g_shift = torch.zeros(n, 8, 3, device=device, dtype=torch.float32)
         adjoints = [g_sdf.view(-1), g_shift.view(-1, 3), g_alpha.view(-1), g_beta.view(-1)]
-        arguments = [*_DualVertices.arguments(t, padded, inputs, ctx.scale), g_vertices.contiguous(), *adjoints]
+        arguments = [*_DualVertices.arguments(t, padded, given, ctx.scale), g_vertices.contiguous(), *adjoints]
         launch(flexicubes_adjoint.dual_vertex_adjoint_kernel, n, arguments, device)
         corner = corner_vertices(t).view(-1)
         grads: list[Tensor | None] = [None, None, None, None]
@@ -265,7 +259,7 @@ class _DualVertices(torch.autograd.Function):
         if ctx.needs_input_grad[4]:
             grads[1] = _scatter(corner, g_shift.view(-1, 3), sdf.numel()).view(*sdf.shape, 3)
         real = t.rows >= 0
-        for i, value, g in ((2, inputs[1], g_alpha), (3, inputs[2], g_beta)):
+        for i, value, g in ((2, given[1], g_alpha), (3, given[2], g_beta)):
             if ctx.needs_input_grad[3 + i] and value is not None:
                 every = torch.zeros_like(value)
                 every[t.rows[real].long()] = g[real]
@@ -273,14 +267,19 @@ class _DualVertices(torch.autograd.Function):
         return None, None, None, *grads
 
 
+def corners_of(cells: Tensor, shape: Sequence[int]) -> Tensor:
+    """Grid vertices ``(S, 8)`` at the corners of cubes ``(S,)``, given by their lowest vertices; shape: of the grid."""
+    k = torch.arange(8, device=cells.device, dtype=torch.int64)
+    return cells.long()[:, None] + ((k & 1) * shape[1] + (k >> 1 & 1)) * shape[2] + (k >> 2)
+
+
 def corner_vertices(t: _Topology) -> Tensor:
     """Unpadded grid vertex at every corner of the surface cubes, ``(S, 8)``; padding maps to the border vertex."""
-    cells, k = t.cells.long(), torch.arange(8, device=t.cells.device, dtype=torch.int64)
+    corners = corners_of(t.cells, t.shape)
     if t.pad == 0:  # the common case, about 10 times faster
-        return cells[:, None] + ((k & 1) * t.shape[1] + (k >> 1 & 1)) * t.shape[2] + (k >> 2)
-    at = torch.stack([cells // (t.shape[1] * t.shape[2]), cells // t.shape[2] % t.shape[1], cells % t.shape[2]], -1)
-    at = at[:, None] + torch.stack([k & 1, k >> 1 & 1, k >> 2], -1) - t.pad
-    at = torch.minimum(at.clamp(min=0), torch.tensor(t.cubes, device=cells.device, dtype=torch.int64))
+        return corners
+    at = torch.stack(torch.unravel_index(corners, t.shape), -1) - t.pad
+    at = torch.minimum(at.clamp(min=0), torch.tensor(t.cubes, device=at.device, dtype=torch.int64))
     return (at[..., 0] * (t.cubes[1] + 1) + at[..., 1]) * (t.cubes[2] + 1) + at[..., 2]
 
 
@@ -294,7 +293,7 @@ def _quads(t: _Topology, padded: Tensor, crossed: Tensor, gamma: Tensor | None) 
     quads = torch.empty(len(origin), 4, dtype=torch.int32, device=device)
     split = torch.empty(len(origin), 4, device=device, dtype=torch.float32)
     weights = padded.new_empty(0) if gamma is None else gamma.detach().contiguous()
-    inputs = [origin, direction, t.surface, _struct_of_tables(device), t.grid(padded, None), weights]
+    inputs = [origin, direction, t.surface, _struct_of_tables(device), t.grid(padded, padded.new_empty(0)), weights]
     launch(kernels.quad_kernel, len(origin), [*inputs, quads.view(-1), split.view(-1)], device)
     return quads, split
 
