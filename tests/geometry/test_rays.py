@@ -61,25 +61,7 @@ def test_backends_agree_on_a_million_ray_queries(device):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_not_finite_and_zero_rays_miss(device, backend):
-    mesh = trimesh.creation.icosphere(subdivisions=1)
-    scene = make(mesh.vertices, mesh.faces, backend, device)
-    inf, nan = float("inf"), float("nan")
-    o = torch.zeros(9, 3, device=device)
-    d = torch.ones(9, 3, device=device)
-    d[0, 0], d[1, 1], d[2, 2], o[3, 0], o[4, 1], o[5, 2] = nan, inf, -inf, nan, inf, -inf
-    d[6] = 0.0
-    d[7] = 1e-30
-    hits = scene.closest(o, d)
-    assert hits.face.tolist()[:7] == [-1] * 7 and hits.face.tolist()[7] >= 0 and hits.face.tolist()[8] >= 0
-    assert scene.occluded(o, d).tolist() == [False] * 7 + [True, True]
-    for far in (nan, -1.0, 0.0):
-        assert scene.closest(o[8:], d[8:], t_max=far).face.tolist() == [-1]
-        assert not bool(scene.occluded(o[8:], d[8:], t_max=far)[0])
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_limits_shapes_and_refit(device, backend):
+def test_shapes_of_rays_and_hits(device, backend):
     square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     scene = make(square, [[0, 1, 2], [0, 2, 3]], backend, device)
     o = torch.tensor([0.2, 0.1, 2.0], device=device)
@@ -88,15 +70,9 @@ def test_limits_shapes_and_refit(device, backend):
     rounding = 2**-22  # Embree divides by an approximate reciprocal: two units in the last place, 1.8 measured on AVX2
     assert hit.face.shape == () and hit.bary.shape == (2,)
     assert float(hit.t) == pytest.approx(4.0, rel=rounding if backend == "embree" else 0.0, abs=0.0)
-    above = torch.nextafter(hit.t, torch.full_like(hit.t, torch.inf))  # limits are of t as it is rounded
-    assert int(scene.closest(o, d, t_max=hit.t).face) == -1 and int(scene.closest(o, d, t_max=above).face) >= 0
-    assert not bool(scene.occluded(o, d, t_max=hit.t)) and bool(scene.occluded(o, d, t_max=above))
     many = scene.closest(o.expand(2, 1, 3), d.expand(1, 5, 3), t_max=torch.full((2, 5), 9.0, device=device))
     assert many.face.shape == (2, 5) and bool((many.face >= 0).all())
     assert scene.closest(o.expand(0, 3), d.expand(0, 3)).face.shape == (0,)
-    moved = torch.as_tensor(square, dtype=torch.float32, device=device) + torch.tensor([0, 0, 1.0], device=device)
-    scene.refit(moved)
-    assert float(scene.closest(o, d).t) == pytest.approx(2.0, rel=rounding, abs=0.0)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -105,37 +81,14 @@ def test_degenerate_meshes_are_data_and_broken_ones_are_named(device, backend):
     o, d = torch.tensor([[0.2, 0.2, 1.0]], device=device), torch.tensor([[0.0, 0.0, -1.0]], device=device)
     scene = make(vertices, [[0, 1, 3], [1, 1, 2], [0, 1, 2], [0, 1, 2]], backend, device)
     assert int(scene.closest(o, d).face) in (2, 3)
-    for empty in (np.zeros((0, 3), np.int32), np.zeros((0, 3), np.int32)[:0]):
-        nothing = make(vertices, empty, backend, device)
-        assert int(nothing.closest(o, d).face) == -1 and not bool(nothing.occluded(o, d)[0])
+    nothing = make(vertices, np.zeros((0, 3)), backend, device)
+    assert int(nothing.closest(o, d).face) == -1 and not bool(nothing.occluded(o, d)[0])
     with pytest.raises(ValueError, match="backend: expected"):
         make(vertices, [[0, 1, 2]], "optix", device)
-    with pytest.raises(TypeError, match="origins: expected"):
-        scene.closest(o.double(), d)
     with pytest.raises(
         ValueError, match=r"origins, directions, t_max: .* that broadcast, got \(2, 3\), \(3, 3\), \(\)"
     ):
         scene.closest(o.expand(2, 3), d.expand(3, 3))
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("scale, shift", [(1.0, 0.0), (1e-4, 0.0), (1e3, 0.0), (1.0, 50.0)])
-def test_offset_rays_do_not_hit_their_own_face(device, backend, scale, shift):
-    vertices, faces = soup(5, 400)
-    vertices = (vertices * scale + shift).astype(np.float32)
-    scene = make(vertices, faces, backend, device)
-    rng = np.random.default_rng(2)
-    n = 100_000
-    face = torch.tensor(rng.integers(0, len(faces), n), dtype=torch.int32, device=device)
-    b = rng.random((n, 2))
-    b = np.where(b.sum(1, keepdims=True) > 1, 1 - b, b)
-    bary = torch.tensor(b, dtype=torch.float32, device=device)
-    v, f = scene.vertices, scene.faces
-    position, ng = interpolate(v, f, face, bary), hit_normals(v, f, face)
-    d = torch.tensor(rng.normal(size=(n, 3)), dtype=torch.float32, device=device)
-    d = torch.nn.functional.normalize(d, dim=-1)
-    hits = scene.closest(offset_origin(position, ng, d, scene.scale), d)
-    assert int((hits.face == face).sum()) == 0
 
 
 def solved(a, b, c, o, d):
@@ -207,11 +160,12 @@ def test_a_far_closed_mesh_is_watertight(device, backend):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_rays_that_leave_any_triangle_never_meet_it_again(device, backend):
-    """After pbrt's Triangle.Reintersect: corners of magnitude 1e-6 to 1e6, rays from inside the face."""
+    """After pbrt's Triangle.Reintersect: corners of magnitude 1e-6 to 1e6, rays from inside the face.  Every second
+    triangle is far from the origin for its size."""
     rng = np.random.default_rng(9)
-    for _ in range(60):
+    for far in [0.0, 150.0] * 60:
         size = 10.0 ** rng.uniform(-6, 6, (3, 1))
-        corners = (rng.uniform(-1, 1, (3, 3)) * size).astype(np.float32)
+        corners = (rng.uniform(-1, 1, (3, 3)) + far) * (size[0] if far else size)
         scene = make(corners, [[0, 1, 2]], backend, device)
         b = rng.dirichlet((1, 1, 1), 500)[:, 1:]
         face = torch.zeros(500, dtype=torch.int32, device=device)
