@@ -1,26 +1,21 @@
 """Displacement to given normals against its solution for a wave, a noisy ball, and its limits."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 import trimesh
 
-from reli3d.geometry.mesh import Mesh, vertex_normals
+from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.normals import displace_to_normals
 from tests.support.meshes import mesh_from, sheet
-
-
-def with_normals(mesh):
-    return replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces))
 
 
 def noisy_ball(device, noise=0.01):
     mesh = mesh_from(trimesh.creation.icosphere(subdivisions=4), device=device)
     rng = torch.Generator().manual_seed(0)
     radius = 1 + noise * torch.randn(len(mesh.vertices), 1, generator=rng).to(device)
-    return with_normals(Mesh(mesh.vertices * radius, mesh.faces)), mesh.vertices
+    return Mesh(mesh.vertices * radius, mesh.faces).with_normals(), mesh.vertices
 
 
 def unlimited(mesh):
@@ -35,7 +30,7 @@ def angles(a, b):
 def test_a_wave_of_normals_on_a_plane_becomes_the_wave_of_least_energy(waves, device):
     cells = 128  # of side 1
     bumpy, _ = sheet(cells + 1)
-    plane = with_normals(Mesh((bumpy.vertices * torch.tensor([1.0, 1.0, 0.0])).to(device), bumpy.faces.to(device)))
+    plane = Mesh(bumpy.vertices * torch.tensor([1.0, 1.0, 0.0]), bumpy.faces).to(device).with_normals()
     x, up = plane.vertices[:, 0], plane.normals[0]
     length, height, k = 6.0, 0.01, 2 * math.pi * waves / cells
     slope = torch.zeros_like(plane.normals)
@@ -64,7 +59,7 @@ def test_noise_of_positions_is_removed_by_true_normals(device):
 
 
 def test_a_ball_with_its_own_normals_stays(device):
-    ball = with_normals(mesh_from(trimesh.creation.icosphere(subdivisions=3), device=device))
+    ball = mesh_from(trimesh.creation.icosphere(subdivisions=3), device=device).with_normals()
     got = displace_to_normals(ball, ball.vertices, length=0.1, limit=unlimited(ball))
     # every chord is perpendicular to the mean of the normals at its ends
     assert torch.allclose(got.vertices, ball.vertices, atol=1e-6)
@@ -85,7 +80,7 @@ def test_scale_and_rotation_commute_with_the_displacement():
     mesh, true = noisy_ball("cpu")
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1)))[0]
     turn = turn * torch.linalg.det(turn)
-    moved = with_normals(Mesh((mesh.vertices @ turn.T * 7).contiguous(), mesh.faces))
+    moved = Mesh((mesh.vertices @ turn.T * 7).contiguous(), mesh.faces).with_normals()
     got = displace_to_normals(moved, (true @ turn.T).contiguous(), length=7 * 0.2, limit=unlimited(mesh))
     expected = displace_to_normals(mesh, true, length=0.2, limit=unlimited(mesh)).vertices @ turn.T * 7
     # 2e-3 of the radius: two runs of the solver, each to a relative residual of 1e-3

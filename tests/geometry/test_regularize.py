@@ -1,7 +1,5 @@
 """FlexiCubes regularizers against float64 formulations and closed forms; fields in batches."""
 
-import math
-
 import pytest
 import torch
 
@@ -62,12 +60,6 @@ def test_entropy_matches_cross_entropy_in_float64(device):
     )
 
 
-def test_entropy_of_one_change_is_the_closed_form():
-    sdf = torch.ones(2, 2, 2)
-    sdf[0] = -1.0
-    assert float(sign_entropy(sdf)) == pytest.approx(2 * math.log1p(math.e), rel=1e-6)
-
-
 def test_entropy_removes_a_floater_that_nothing_holds():
     sdf = sphere(8, radius=0.5)
     sdf[1, 1, 1] = -0.05
@@ -83,17 +75,17 @@ def deviation(weights):
 
 
 @pytest.mark.parametrize(
-    "call, error, name",
+    "call, name",
     [
-        (lambda: sign_entropy(torch.ones(3, 3)), ValueError, "sdf"),
-        (lambda: sign_entropy(torch.ones(3, 3, 1)), ValueError, "sdf"),
-        (lambda: sign_entropy(torch.full((3, 3, 3), float("nan"))), ValueError, "sdf"),
-        (lambda: vertex_deviation(torch.ones(3, 3), radius=1.0), ValueError, "sdf"),
-        (lambda: vertex_deviation(sphere(4), radius=-1.0), ValueError, "radius"),
-        (lambda: deviation(CubeWeights(beta=torch.zeros(64, 12))), ValueError, "beta"),
-        (lambda: deviation(CubeWeights(alpha=torch.ones(9, 8))), ValueError, "alpha"),
+        (lambda: sign_entropy(torch.ones(3, 3)), "sdf"),
+        (lambda: sign_entropy(torch.ones(3, 3, 1)), "sdf"),
+        (lambda: sign_entropy(torch.full((3, 3, 3), float("nan"))), "sdf"),
+        (lambda: vertex_deviation(torch.ones(3, 3), radius=1.0), "sdf"),
+        (lambda: vertex_deviation(sphere(4), radius=-1.0), "radius"),
+        (lambda: deviation(CubeWeights(beta=torch.zeros(64, 12))), "beta"),
+        (lambda: deviation(CubeWeights(alpha=torch.ones(9, 8))), "alpha"),
     ],
 )
-def test_wrong_input_is_named(call, error, name):
-    with pytest.raises(error, match=name):
+def test_wrong_input_is_named(call, name):
+    with pytest.raises(ValueError, match=name):
         call()

@@ -95,20 +95,6 @@ def test_every_sign_pattern_is_a_closed_outward_manifold_with_a_ball_for_every_c
     assert bool((volumes > 0).all())
 
 
-def test_one_inside_vertex_has_the_eight_dual_vertices_of_the_closed_form(device):
-    """One vertex at -0.8, all others at 0.2: each edge is crossed at 0.8 of its length of 1/4, and a dual vertex is the
-    mean of three crossings."""
-    sdf = torch.full((5, 5, 5), 0.2, device=device)
-    sdf[2, 2, 2] = -0.8
-    mesh = extract_surface(sdf, radius=0.5)
-    assert mesh.faces.shape == (12, 3) and report(mesh).watertight
-    sign = torch.tensor([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.8 / 4 / 3
-    got = mesh.vertices.cpu()
-    order = torch.from_numpy(np.lexsort(got.sign().numpy().T[::-1]))
-    torch.testing.assert_close(got[order], sign, rtol=0, atol=1e-7)  # float32 of 0.0667
-    assert volume(mesh) == pytest.approx((2 * 0.8 / 12) ** 3, rel=1e-5)  # a cube of that half side
-
-
 @pytest.mark.parametrize("case", range(1, 255, 11))
 def test_one_cube_is_closed_at_the_box(device, case):
     sdf = sign_pattern(case).contiguous().to(device)
@@ -186,30 +172,28 @@ def test_weights_of_surface_cubes_only(device):
 
 
 @pytest.mark.parametrize(
-    "change, error, name",
+    "change, name",
     [
-        (dict(sdf=torch.full((4, 4, 4), float("nan"))), ValueError, "sdf"),
-        (dict(sdf=torch.eye(4).expand(4, 4, 4).sub(0.5) * float("inf")), ValueError, "sdf"),
-        (dict(sdf=torch.ones(4, 4)), ValueError, "sdf"),
-        (dict(sdf=torch.ones(1, 4, 4)), ValueError, "sdf"),
-        (dict(sdf=torch.ones(4, 4, 4, dtype=torch.float64)), TypeError, "sdf"),
-        (dict(radius=0.0), ValueError, "radius"),
-        (dict(radius=(1.0, 2.0)), ValueError, "radius"),
-        (dict(alpha=torch.ones(63, 8)), ValueError, "alpha"),
-        (dict(beta=torch.ones(64, 8)), ValueError, "beta"),
-        (dict(gamma=torch.zeros(64)), ValueError, "gamma"),
-        (dict(gamma=torch.ones(64, 1)), ValueError, "gamma"),
-        (dict(gamma=torch.ones(64, dtype=torch.float16)), TypeError, "gamma"),
-        (dict(deformation=torch.zeros(4, 4, 4, 3)), ValueError, "deformation"),
-        (dict(alpha=-torch.ones(64, 8)), ValueError, "alpha"),
-        (dict(beta=torch.zeros(64, 12)), ValueError, "beta"),
-        (dict(deformation=torch.full((5, 5, 5, 3), float("nan"))), ValueError, "deformation"),
-        (dict(cubes=torch.zeros(3, dtype=torch.int64)), ValueError, "cubes"),
+        (dict(sdf=torch.full((4, 4, 4), float("nan"))), "sdf"),
+        (dict(sdf=torch.eye(4).expand(4, 4, 4).sub(0.5) * float("inf")), "sdf"),
+        (dict(sdf=torch.ones(4, 4)), "sdf"),
+        (dict(sdf=torch.ones(1, 4, 4)), "sdf"),
+        (dict(radius=0.0), "radius"),
+        (dict(radius=(1.0, 2.0)), "radius"),
+        (dict(alpha=torch.ones(63, 8)), "alpha"),
+        (dict(beta=torch.ones(64, 8)), "beta"),
+        (dict(gamma=torch.zeros(64)), "gamma"),
+        (dict(gamma=torch.ones(64, 1)), "gamma"),
+        (dict(deformation=torch.zeros(4, 4, 4, 3)), "deformation"),
+        (dict(alpha=-torch.ones(64, 8)), "alpha"),
+        (dict(beta=torch.zeros(64, 12)), "beta"),
+        (dict(deformation=torch.full((5, 5, 5, 3), float("nan"))), "deformation"),
+        (dict(cubes=torch.zeros(3, dtype=torch.int64)), "cubes"),
     ],
 )
-def test_wrong_input_is_named(change, error, name):
+def test_wrong_input_is_named(change, name):
     arguments = dict(sdf=sphere(4), radius=1.0) | change
-    with pytest.raises(error, match=name):
+    with pytest.raises(ValueError, match=name):
         sdf, radius = arguments.pop("sdf"), arguments.pop("radius")
         extract_surface(sdf, radius=radius, weights=CubeWeights(**arguments))
 
@@ -246,9 +230,10 @@ def test_gradients_behind_the_mesh_are_bitwise_identical_for_any_number_of_threa
         shown = unwrap(taubin_smooth(mesh.with_normals(), iterations=2), texture_size=64)
         spread = vertex_deviation(leaves["sdf"], radius=1.0, weights=CubeWeights(**given))
         seen = [mesh.vertices, shown.vertices, shown.normals, spread]
+        atlas = shown.uv, shown.faces
         rng = torch.Generator().manual_seed(1)
         cotangent = [torch.randn(v.shape, generator=rng) for v in seen]
-        results.append([*seen, *torch.autograd.grad(seen, list(leaves.values()), cotangent)])
+        results.append([*seen, *atlas, *torch.autograd.grad(seen, list(leaves.values()), cotangent)])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from reli3d.geometry.mesh import face_normals, report
 from reli3d.geometry.surface import extract_surface
+from tests.support.meshes import volume
 from tests.support.reference_surface import grid, sphere, torus
 
 F = torch.nn.functional
@@ -42,11 +43,6 @@ def fraction_below(offset, n):
     return float((0.5 + reached.clamp(-1, 1).asin() / np.pi).mean())
 
 
-def volume64(mesh):
-    a, b, c = (mesh.vertices.double()[mesh.faces[:, k].long()] for k in range(3))
-    return float((a * torch.linalg.cross(b, c)).sum() / 6)
-
-
 def orders(errors):
     return [np.log(a / b) / np.log(2) for a, b in zip(errors[:-1], errors[1:])]
 
@@ -65,7 +61,7 @@ def test_volume_converges_with_second_order_and_the_genus_is_right(device, shape
         found = report(mesh)
         assert found.watertight and found.manifold
         assert (found.euler, found.components) == (EULER[shape], 1 + (shape == "two spheres"))
-        errors.append(abs(volume64(mesh) - np.pi * VOLUME[shape]))
+        errors.append(abs(volume(mesh) - np.pi * VOLUME[shape]))
         if shape == "sphere":
             outward = (face_normals(mesh.vertices, mesh.faces) * mesh.vertices[mesh.faces[:, 0].long()]).sum(-1)
             assert bool((outward > 0).all())
@@ -84,7 +80,7 @@ def test_volume_of_the_gyroid_converges_with_second_order(device, offset):
     errors = []
     for n in RESOLUTIONS:
         fields = [gyroid(np.pi * grid(n, device=device) + at.to(device))[0] - offset for at in begins]
-        off = [volume64(extract_surface(sdf, radius=1.0)) - exact[1] for sdf in fields]
+        off = [volume(extract_surface(sdf, radius=1.0)) - exact[1] for sdf in fields]
         errors.append(float(np.sqrt(np.mean(np.square(off)))))
     assert errors[-1] > 1e-3 and min(orders(errors)) >= 1.8, errors
 

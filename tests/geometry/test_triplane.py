@@ -40,19 +40,6 @@ def test_features_match_the_published_release(goldens, device):
     torch.testing.assert_close(got, torch.from_numpy(data["features"]), rtol=0, atol=2e-5)  # float32 of values up to 4
 
 
-def test_a_texel_center_gives_the_texel_and_a_face_of_the_cube_half(device):
-    planes = torch.zeros(1, 3, 2, 4, 8, device=device)
-    planes[0, :, :, 1, 6] = 1.0
-    planes[0, 0, 1] *= 3.0
-    x, y = (6 + 0.5) / 8 * 2 - 1, (1 + 0.5) / 4 * 2 - 1
-    got = sample_triplane(planes, torch.tensor([[[x, y, y], [x, -1.0, 5.0]]], device=device))[0].cpu()
-    assert got[0].tolist() == [1.0, 3.0, 1.0, 1.0, 0.0, 0.0]  # YZ takes y along W, where nothing is
-    assert got[1].tolist() == [0.0] * 6
-    ones = torch.ones(1, 3, 1, 4, 8, device=device)
-    border = sample_triplane(ones, torch.tensor([[[1.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.5, 0.0, 0.0]]], device=device))
-    assert border[0].tolist() == [[0.5, 0.5, 1.0], [0.25, 0.25, 0.25], [0.0, 0.0, 1.0]]
-
-
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_storage_is_summed_in_float32(device, dtype):
     planes, points, weights = inputs(1, 8, 6, 7, 4000, device)
