@@ -128,17 +128,11 @@ def image(folder):
 
 def mirrored():
     rig = camera(6)
-    masks = torch.stack([_mask(rig, k) for k in range(6)])
+    shape = ball()
+    scene = reli3d.RayScene(shape.vertices * floats(1.0, 0.8, 0.5), shape.faces)
+    masks = scene.closest(*camera_rays(rig)).valid.float()
     found = symmetry.mirror_plane(hull.mask_distance(masks), rig)
     return masks, found, symmetry.upright(rig), symmetry.MirrorPlane(floats(1.0, 0.0, 0.0), 0.1).mirrored(rig)
-
-
-def _mask(rig: Camera, k: int) -> Tensor:
-    shape = ball()
-    one = Camera(rig.c2w[k], rig.intrinsics[k], rig.width, rig.height)
-    origins, directions = camera_rays(one)
-    hits = reli3d.RayScene(shape.vertices * floats(1.0, 0.8, 0.5), shape.faces).closest(origins, directions)
-    return (hits.face >= 0).float()
 
 
 def meshes():
