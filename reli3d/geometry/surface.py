@@ -235,7 +235,7 @@ class _DualVertices(torch.autograd.Function):
     @staticmethod
     def arguments(t: _Topology, padded: Tensor, given: Sequence[Tensor | None], scale: tuple) -> list:
         none = padded.new_empty(0)
-        shift, alpha, beta = (none if v is None else v.detach().reshape(-1) for v in given)
+        shift, alpha, beta = (none if v is None else v.detach().contiguous().view(-1) for v in given)
         weights = struct_of(kernels.Weights, alpha=alpha, beta=beta)
         return [t.surface, _struct_of_tables(padded.device), t.grid(padded, shift), weights, wp.vec3(*scale)]
 
