@@ -1,4 +1,4 @@
-"""Direct lighting of a hit by multiple importance sampling: all strategies in one loop, no per-sample arrays.
+"""Direct lighting of a hit by multiple importance sampling.
 
 Strategies in the order of the sample index: environment map, visible normals (with antithetic pairs, an even index is
 the original sample and the next odd one its partner), cosine.  A sample contributes ``f L cos w / (n p)``: f is the

@@ -183,8 +183,8 @@ class LocalReconstructor(nn.Module):
         silhouette distance in pixels, from which colors are read.  detail_intrinsics: ``(V, 4)`` in its pixels.
         mirrored: number of views at the end that are the first views, flipped left to right, with mirrored cameras, for
         shape and material alone.  inference: without gradient, by fused kernels, equal to float32 rounding.  Gradients
-        reach every parameter, those of the cost volume from two input views.  Raises ValueError if more than half of
-        the views are mirrored.
+        reach every parameter, those of the cost volume from two input views.  Raises ValueError if more than half are
+        mirrored.
         """
         with torch.set_grad_enabled(torch.is_grad_enabled() and not inference):
             views = images, masks, c2w, intrinsics, detail, detail_intrinsics
