@@ -53,6 +53,14 @@ def test_a_surface_that_leaves_the_region_is_followed():
             assert torch.equal(got.narrow(axis, k, 32)[ends], sdf.narrow(axis, k, 32)[ends])
 
 
+@pytest.mark.parametrize(("depth", "found"), [(0.9 * INSIDE_DEPTH, True), (1.1 * INSIDE_DEPTH, False)])
+def test_a_cavity_between_coarse_points_is_found_where_they_are_shallow(depth, found):
+    sdf = torch.full((9, 9, 9), -depth)
+    sdf[3, 3, 3] = 1.0
+    got, _ = sparse(sdf, torch.ones(9, 9, 9, dtype=torch.bool))
+    assert bool(got[3, 3, 3] > 0) == found
+
+
 def test_known_values_outside_the_region_are_kept():
     known = torch.full((9, 9, 9), -5.0)
     got, evaluated = sparse(known, torch.zeros(9, 9, 9, dtype=torch.bool), known=known)

@@ -81,6 +81,14 @@ def test_augmented_maps_agree_with_the_points(folder):
             assert float(difference.max()) < 0.03  # patterns are finer than a pixel in places: the median is not
 
 
+def test_random_turns_are_rotations_with_four_up_axes():
+    turns = torch.stack([random_turn(np.random.default_rng(seed)) for seed in range(200)])
+    torch.testing.assert_close(turns @ turns.mT, torch.eye(3).expand(200, 3, 3), rtol=0, atol=1e-6)  # float32
+    torch.testing.assert_close(torch.linalg.det(turns), torch.ones(200), rtol=0, atol=1e-5)  # the same
+    ups = {tuple(up.round().int().tolist()) for up in turns[:, :, 1]}
+    assert ups == {(0, 1, 0), (0, 0, 1), (1, 0, 0), (0, -1, 0)}
+
+
 def test_a_turn_carries_light_and_surface_together(folder):
     """+X is bright: whatever the turn or mirror, surface that faces the bright side is brighter."""
     for s in drawn(folder, range(6), points=2048, max_views=1):
