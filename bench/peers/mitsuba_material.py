@@ -60,7 +60,7 @@ def material(mi, base_color, alpha, metallic, diffuse_model="conserving", maps: 
             d = distribution.eval(h)  # Mitsuba's own density and masking; G2 from the two G1 is height-correlated Smith
             g = 1.0 / (dr.rcp(distribution.smith_g1(i, h)) + dr.rcp(distribution.smith_g1(o, h)) - 1.0)
             f0 = 0.04 * (1 - metallic) + base * metallic
-            schlick = lambda cos: f0 + (1 - f0) * (1 - cos) ** 5  # noqa: E731
+            schlick = lambda cos: f0 + (1 - f0) * (1 - cos) ** 5
             f = schlick(dr.dot(i, h))
             left = 1 - f
             if diffuse_model == "conserving":

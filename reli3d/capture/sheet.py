@@ -45,7 +45,7 @@ def _panel(title: str, points: np.ndarray, eyes: np.ndarray) -> Image.Image:
     draw = ImageDraw.Draw(panel)
     both = np.concatenate([points, eyes, np.zeros((1, 2))])
     middle, reach = (both.min(0) + both.max(0)) / 2, 0.55 * float(np.ptp(both, axis=0).max()) + 1e-9
-    place = lambda p: ((p - middle) / reach * 0.5 + 0.5) * PANEL  # noqa: E731
+    place = lambda p: ((p - middle) / reach * 0.5 + 0.5) * PANEL
     for x, y in place(points):
         draw.point((x, y), fill="#5070a0")
     for k, (x, y) in enumerate(place(eyes)):

@@ -213,7 +213,7 @@ def _on_ray(ray, start: Callable[[], Job], items: Sequence[Item], gpu: bool) -> 
         return 2 * int(ray.cluster_resources().get("CPU", 1)) + 2
 
     try:
-        submit = lambda item: (task.remote(job, item).future(), None)  # noqa: E731
+        submit = lambda item: (task.remote(job, item).future(), None)
         yield from _rows(submit, items, ahead, ray.exceptions.WorkerCrashedError, alone=False)
     finally:
         ray.shutdown()

@@ -58,7 +58,7 @@ def load_reference(
     points = torch.cat([p.mesh.vertices for p in parts])
     low, high = points.amin(0), points.amax(0)
     scale = 1.0 / float((high - low).max())
-    move = lambda mesh: replace(mesh, vertices=((mesh.vertices - (low + high) / 2) * scale).contiguous())  # noqa: E731
+    move = lambda mesh: replace(mesh, vertices=((mesh.vertices - (low + high) / 2) * scale).contiguous())
     moved = [replace(part, mesh=move(part.mesh)) for part in parts]
     drawn = sample_cameras(np.random.default_rng((seed, 5)), inputs + HELD_OUT_VIEWS)
     poses = zip(torch.as_tensor(drawn[0], device="cpu"), drawn[1].tolist(), strict=True)

@@ -43,7 +43,7 @@ class RefineOptions:
     """
 
     resolution: int = RESOLUTION
-    weights: losses.Weights = losses.Weights()  # noqa: RUF009 # it is frozen
+    weights: losses.Weights = losses.Weights()  # it is frozen
     cameras: bool = False
     light: str | Sequence[Hashable] = "object"
     light_chromaticity: float = CHROMATICITY_WEIGHT

@@ -379,12 +379,12 @@ class LocalField:
 
     def heads(self, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
         """Raw outputs ``(N, HEAD_OUTPUTS)`` for :meth:`material_from_heads`: smooth, so that vertices suffice."""
-        evaluate = lambda p, n, v: {"heads": self._heads(self.fused(p, n, v), p, n, v)}  # noqa: E731
+        evaluate = lambda p, n, v: {"heads": self._heads(self.fused(p, n, v), p, n, v)}
         return self._rows(evaluate, position, normal, visible)["heads"]
 
     def material_from_heads(self, heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> SurfacePoints:
         """:meth:`material` at surface points with given, possibly interpolated ``heads (N, HEAD_OUTPUTS)``."""
-        evaluate = lambda h, p, n, v: _material(self.fused(p, n, v), h, n)  # noqa: E731
+        evaluate = lambda h, p, n, v: _material(self.fused(p, n, v), h, n)
         return SurfacePoints(position, normal, **self._rows(evaluate, heads, position, normal, visible))
 
     def _heads(self, fused: Fused, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:

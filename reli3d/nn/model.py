@@ -96,7 +96,7 @@ class Reconstructor(nn.Module):
         if 0 in lead:
             raise ValueError(f"images: expected at least one object and one view, got {lead}")
         camera = self.camera(tokenizers.camera_vector(c2w, intrinsics, images.shape[2]))
-        extra = lambda sizes, mask: mask.unsqueeze(2).to(self.dtype) if sizes.mask_channel else None  # noqa: E731
+        extra = lambda sizes, mask: mask.unsqueeze(2).to(self.dtype) if sizes.mask_channel else None
         composite = torch.lerp(torch.full_like(images, BACKGROUND), images, masks.unsqueeze(-1))
         tokens = self.encoder(composite, camera, extra(self.preset.encoder, masks))
         planes = self.bank.planes(self.backbone(self.bank.tokens(), tokens))

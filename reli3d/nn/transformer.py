@@ -120,7 +120,7 @@ class MainBlock(nn.Module):
     def __init__(self, width: int, heads: int, basic_blocks: int, experts: int):
         super().__init__()
         self.fuse_block_in = FuseBlock(width, heads)
-        feed_forward = lambda: Experts(width, experts) if experts else FeedForward(width)  # noqa: E731
+        feed_forward = lambda: Experts(width, experts) if experts else FeedForward(width)
         self.transformer_block = nn.ModuleList(
             BasicBlock(width, Attention(width, heads), Attention(width, heads), feed_forward())
             for _ in range(basic_blocks)

@@ -16,7 +16,7 @@ def _leg(a: Assembly, part: int, foot: np.ndarray, top: np.ndarray, thick: float
     rng = a.rng
     if style == 0:
         ring = thick * 0.5 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
-        at = lambda q, s: np.stack([ring[:, 0] * s + q[0], np.full(4, q[1]), ring[:, 1] * s + q[2]], -1)  # noqa: E731
+        at = lambda q, s: np.stack([ring[:, 0] * s + q[0], np.full(4, q[1]), ring[:, 1] * s + q[2]], -1)
         a.add(p.Manifold.hull_points(np.concatenate([at(foot, 0.8), at(top, 1.0)])), part)
     elif style == 1:
         a.add(p.tube([foot, top], np.array([0.3, 0.5]) * thick, segments=16), part)
@@ -99,7 +99,7 @@ def chair(a: Assembly) -> None:
     if soft != wood:
         c = u(0.04, 0.11)
         a.add(p.box((w * 0.97, c, d * 0.97), c * 0.45), soft, (0, h + c / 2, 0.005))
-    at = lambda s, y: np.array([s * (w / 2 - thick / 2), h + y, -d / 2 + thick / 2 - lean * y])  # noqa: E731
+    at = lambda s, y: np.array([s * (w / 2 - thick / 2), h + y, -d / 2 + thick / 2 - lean * y])
     for s in (-1, 1):
         _leg(a, wood, at(s, -0.02), at(s, back), thick, int(rng.integers(2)))
     style = rng.random()
@@ -121,7 +121,7 @@ def chair(a: Assembly) -> None:
             a.add(p.cylinder(0.018, y - h, segments=8), wood, (s * w / 2, (y + h) / 2, front))
     if rng.random() < 0.25:  # bent, as a molded shell
         k = u(0.2, 0.7)
-        bend = lambda q: q[:, 2] + k * q[:, 0] ** 2 * (q[:, 1] > h) * np.sign(q[:, 2])  # noqa: E731
+        bend = lambda q: q[:, 2] + k * q[:, 0] ** 2 * (q[:, 1] > h) * np.sign(q[:, 2])
         a.warp(lambda q: np.column_stack([q[:, :2], bend(q)]), 0.08)
 
 

@@ -41,7 +41,7 @@ class Material:
 
     def at(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Base color ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)`` and bump-mapped normal ``(N, 3)``."""
-        row = lambda coat: points.new_tensor([*coat.color, coat.roughness, coat.metallic]).expand(len(points), 5)  # noqa: E731
+        row = lambda coat: points.new_tensor([*coat.color, coat.roughness, coat.metallic]).expand(len(points), 5)
         value = row(self.base)
         for coat, weight in self.layers:
             value = torch.lerp(value, row(coat), weight(points, normals)[:, None])

@@ -43,7 +43,7 @@ def vessel(a: Assembly) -> None:
         handles = 1 if rng.random() < 0.6 else 2
         low, high = sorted(u(0.15, 0.9, 2) * height)
         high = max(high, low + 0.25 * height)
-        at = lambda y: float(np.interp(y, fine[:, 1], fine[:, 0]))  # noqa: E731
+        at = lambda y: float(np.interp(y, fine[:, 1], fine[:, 0]))
         out = wide + u(0.12, 0.5)
         reach = [at(low) * 0.96, (out + at(low)) / 2, out, (out + at(high)) / 2, at(high) * 0.96]
         path = p.curve(np.stack([reach, [low, low - 0.02, (low + high) / 2, high + 0.03, high]], -1), 20)

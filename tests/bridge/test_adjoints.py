@@ -197,7 +197,7 @@ def points_of_a_mesh(g, tangents) -> Op:
 
     def in_float64(*values):
         v = dict(zip(leaves, values, strict=True))
-        at = lambda name: on_faces(v[name], faces, face, v["bary"])  # noqa: E731
+        at = lambda name: on_faces(v[name], faces, face, v["bary"])
         a, b, c = v["vertices"][faces[face.long()].long()].unbind(1)
         n = F.normalize(at("normals"), dim=-1)
         if tangents:

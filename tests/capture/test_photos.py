@@ -225,8 +225,8 @@ SRGB = (0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.060
 
 def matrix_profile(title: str, columns: tuple, exponent: float) -> bytes:
     """An ICC profile with the XYZ of red, green and blue, and an exponent."""
-    number = lambda v: round(v * 65536).to_bytes(4, "big", signed=True)  # noqa: E731
-    xyz = lambda *v: b"XYZ \0\0\0\0" + b"".join(map(number, v))  # noqa: E731
+    number = lambda v: round(v * 65536).to_bytes(4, "big", signed=True)
+    xyz = lambda *v: b"XYZ \0\0\0\0" + b"".join(map(number, v))
     curve = b"curv\0\0\0\0" + (1).to_bytes(4, "big") + round(exponent * 256).to_bytes(2, "big") + b"\0\0"
     name = title.encode() + b"\0"
     text = b"desc\0\0\0\0" + len(name).to_bytes(4, "big") + name + b"\0" * (79 + -len(name) % 4)

@@ -15,7 +15,7 @@ def test_radial_bump_matches_the_published_frame(goldens):
 
 def formula(position, normal, bump):
     """The published frame, in plain torch; 0 on the vertical axis, where there is no tangent."""
-    unit = lambda v: v / v.norm(dim=-1, keepdim=True).clamp(min=1e-7)  # noqa: E731
+    unit = lambda v: v / v.norm(dim=-1, keepdim=True).clamp(min=1e-7)
     up = torch.tensor([0.0, 1.0, 0.0], dtype=position.dtype).expand_as(position)
     tangent = torch.linalg.cross(normal, torch.linalg.cross(torch.linalg.cross(up, position), normal))
     tangent = unit(tangent)

@@ -98,7 +98,7 @@ def test_no_surface_sends_out_more_than_comes_in(device):
     """By default: three base colors at once, of any metallic, from a mirror to the roughest, down to the horizon."""
     n = 1 << 14  # Halton points
     u = halton(n).to(device)
-    number = lambda v: torch.tensor(float(v), device=device)  # noqa: E731
+    number = lambda v: torch.tensor(float(v), device=device)
     base = torch.tensor([1.0, 0.5, 0.9], device=device)
     highest, dielectric = 0.0, []
     for roughness in (1e-3, *ROUGHNESS):

@@ -98,8 +98,8 @@ def test_samples_fall_on_texels_by_their_density(device, name):
         gap = float(rows[7] - rows[4])
         first = u[:, 0].double() * (1.0 - gap)
         u[:, 0] = torch.where(first < rows[4], first, first + gap).float().clamp(max=1.0 - 2.0**-24)
-        near = lambda d: (d[:, 1] <= heights[4]) & (d[:, 1] >= heights[7])  # noqa: E731
-        density = lambda d: torch.where(near(d), 0.0, env.pdf(d) / (1.0 - gap))  # noqa: E731
+        near = lambda d: (d[:, 1] <= heights[4]) & (d[:, 1] >= heights[7])
+        density = lambda d: torch.where(near(d), 0.0, env.pdf(d) / (1.0 - gap))
     d, pdf = env.sample(u)
     grid = chi2.Map(height, width, 2 if height * width > 1000 else 5)
     chi2.check(grid, d, density, finest=16)

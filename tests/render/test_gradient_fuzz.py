@@ -28,7 +28,7 @@ def drawn(n, seed=0):
     eighth exactly behind, the rest anywhere above or below; of the parameters half are at an edge, half anywhere.
     """
     g = torch.Generator().manual_seed(seed)
-    unit = lambda: normalize(torch.randn(n, 3, generator=g), dim=-1)  # noqa: E731
+    unit = lambda: normalize(torch.randn(n, 3, generator=g), dim=-1)
     normal, ng, wo, wi = unit(), unit(), unit(), unit()
     for d in (wo, wi):
         kind = torch.randint(8, (n, 1), generator=g)

@@ -119,7 +119,7 @@ def test_value_equals_mitsubas_materials(device, alpha):
     cos_m = (o + i).norm(dim=-1)[:, None] / 2
     t = torch.sqrt(1.5**2 - 1 + cos_m**2)  # Fresnel's equations at refractive index 1.5
     exact = 0.5 * (((cos_m - t) / (cos_m + t)) ** 2 + ((2.25 * cos_m - t) / (2.25 * cos_m + t)) ** 2)
-    schlick = lambda cos: 0.04 + 0.96 * (1 - cos) ** 5  # noqa: E731
+    schlick = lambda cos: 0.04 + 0.96 * (1 - cos) ** 5
     gold = (0.9, 0.6, 0.2)
     rough = {"roughness": alpha**0.5, "specular": 0.5}
     diffuse, black = ({"type": "rgb", "value": v} for v in (list(gold), [0.0, 0.0, 0.0]))

@@ -50,7 +50,7 @@ def test_lobes_follow_their_densities(device, alpha, deg, phi, drawn, seed):
         valid.append(wi[wi[:, 2] > 1e-6])
         total += N
     k = int(drawn == "mirrored")
-    pdf = lambda d: pdf_bsdf(wo, a, d, lobe="mirrored" if k else "visible")  # noqa: E731
+    pdf = lambda d: pdf_bsdf(wo, a, d, lobe="mirrored" if k else "visible")
     wrong = {"width": lambda d: pdf_lobes(wo, 1.02 * a, d)[:, k]}
     if deg >= 45:  # near the normal mirrored ones have almost the density of their originals
         wrong["the other's"] = lambda d: pdf_lobes(wo, a, d)[:, 1 - k]

@@ -40,7 +40,7 @@ def test_lambert_under_constant_light_is_its_closed_form(device, diffuse_model, 
     got = (white - black).double().cpu()
     d, angle = reference.sphere_grid(512)
     d = d[d[:, 1] > 0]
-    schlick = lambda cos: 0.04 + 0.96 * (1 - cos) ** 5  # noqa: E731
+    schlick = lambda cos: 0.04 + 0.96 * (1 - cos) ** 5
     left = (1 - schlick((1 + d[:, 1]) / 2)) * (1 - schlick((1 + cos_o) / 2))
     if diffuse_model == "published":
         left = 1 - schlick((d + view.double()).norm(dim=-1) / 2)

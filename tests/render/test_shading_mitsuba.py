@@ -143,7 +143,7 @@ def compare(runs, expected, variance, theirs):
     sigma = np.sqrt(own + variance.sum() / theirs / got.size**2)
     stripes = 1.0 + 0.02 * np.where(np.arange(len(got)) % 2, 1.0, -1.0)[:, None]
     error = np.sqrt(runs.var(0, ddof=1) / len(runs) + variance / theirs)
-    square = lambda v: (((v - expected) / error) ** 2).mean() * (len(runs) - 3) / (len(runs) - 1)  # noqa: E731
+    square = lambda v: (((v - expected) / error) ** 2).mean() * (len(runs) - 3) / (len(runs) - 1)
     # the square of Student's t with K - 1 degrees is (K - 1) / (K - 3) in the mean; measured 0.93 to 1.04, stripes 1.24
     assert square(got) < 1.15 < square(got * stripes)
     assert abs(got.mean() - expected.mean()) < 3.0 * sigma

@@ -132,7 +132,7 @@ def test_a_triplane_is_marched_and_composited_as_in_float64(device):
         value = read(planes, points[None] / radius)[0] @ heads.T
         return torch.nn.functional.softplus(6.0 * value[:, 0] - 12.0), torch.sigmoid(value[:, 1:])
 
-    density_at = lambda points: field(points, planes, heads, sample_triplane)[0]  # noqa: E731
+    density_at = lambda points: field(points, planes, heads, sample_triplane)[0]
     grid = OccupancyGrid.of_density(density_at, 16, radius, threshold=1.0, device=device)
     origins, directions = rays(device, 300, 9)
     samples = march_rays(origins, directions, grid, 0.02)

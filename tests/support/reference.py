@@ -89,7 +89,7 @@ def eval_bsdf(
     """
     wm = torch.nn.functional.normalize(wo + wi, dim=-1)
     f0 = 0.04 * (1.0 - metallic[..., None]) + base_color * metallic[..., None]
-    schlick = lambda cos: f0 + (1.0 - f0) * (1.0 - cos) ** 5  # noqa: E731
+    schlick = lambda cos: f0 + (1.0 - f0) * (1.0 - cos) ** 5
     fresnel = schlick((wo * wm).sum(-1, keepdim=True))
     left = 1.0 - fresnel
     if diffuse_model == "conserving":
@@ -147,17 +147,17 @@ def shade_gaussians(
 ) -> Tensor:
     """``(N, 3)``: Wang et al. 2009, section 4, for each of four lobes of normals and K of light, and the diffuse part
     with one Fresnel factor, at the axis of the light's product with the cosine (a lobe of sharpness 2.133)."""
-    dot = lambda a, b: (a * b).sum(-1, keepdim=True)  # noqa: E731
+    dot = lambda a, b: (a * b).sum(-1, keepdim=True)
     n, o, base, alpha, metallic = (v[:, None] for v in (normal, wo, base_color, alpha[:, None], metallic[:, None]))
     s = sharpness[:, None]  # everything (N, K, .) from here
     f0 = 0.04 * (1.0 - metallic) + base * metallic
-    schlick = lambda p: f0 + (1.0 - f0) * (1.0 - dot(o, torch.nn.functional.normalize(o + p, dim=-1))) ** 5  # noqa: E731
+    schlick = lambda p: f0 + (1.0 - f0) * (1.0 - dot(o, torch.nn.functional.normalize(o + p, dim=-1))) ** 5
     middle = torch.nn.functional.normalize(axis * s + n * 2.133, dim=-1)
     cos_l = dot(n, axis.expand(len(n), -1, -1)).clamp(-1.0, 1.0)
     out = (1.0 - schlick(middle)) * base * (1.0 - metallic) / torch.pi * sg_cosine_integral(s, cos_l)
     cos_o = dot(n, o).clamp(min=1e-6)
     mirror = 2.0 * cos_o * n - o
-    root = lambda cos: torch.sqrt(alpha**2 + (1.0 - alpha**2) * cos**2)  # noqa: E731
+    root = lambda cos: torch.sqrt(alpha**2 + (1.0 - alpha**2) * cos**2)
     for weight, rate in GGX_NORMALS:
         own = 2.0 * rate / alpha**2
         scale = weight / rate / (2.0 * torch.pi * sg_ends(own)[0])

@@ -126,7 +126,7 @@ def test_corner_normals_of_a_cube_are_flat_and_of_a_ball_radial():
 def test_solids_have_the_volumes_of_their_formulas():
     n = 32
     polygon = n / (2 * np.pi) * np.sin(2 * np.pi / n)  # area of the regular polygon over that of its circle
-    close = lambda solid, volume: abs(solid.volume() / volume - 1) < 1e-5  # noqa: E731  manifold3d keeps vertices to 1e-6
+    close = lambda solid, volume: abs(solid.volume() / volume - 1) < 1e-5  # manifold3d keeps vertices to 1e-6
     assert close(primitives.box((1, 2, 3)), 6)
     assert close(primitives.cylinder(0.5, 2, segments=n), np.pi * 0.25 * 2 * polygon)
     assert close(primitives.cylinder(0.5, 2, top=0.25, segments=n), np.pi * 2 / 3 * (0.25 + 0.125 + 0.0625) * polygon)

@@ -63,7 +63,7 @@ def test_the_same_light_gives_the_same_photographs(sample, sky):
     images, *maps = maps_of(sample)
     got, light = relight_views(images, *maps, sky, np.random.default_rng(3))
     ratio = float(sample["environment"].float().mean() / light.mean())  # the exposures differ
-    linear = lambda x: torch.where(x < 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)  # noqa: E731  IEC 61966-2-1
+    linear = lambda x: torch.where(x < 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     expected, got_linear = linear(images[..., :3]), linear(got[..., :3]) * ratio
     bright = (expected < 0.95).all(-1) & (got[..., :3] < 0.97).all(-1) & maps[2]  # neither is cut off
     assert int(bright.sum()) > 3000

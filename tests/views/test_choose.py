@@ -34,7 +34,7 @@ def test_the_choice_covers_within_twice_the_best():
     rng = torch.Generator().manual_seed(4)
     cameras = rig(*[(360 * x, 80 * y - 30, 2 + z) for x, y, z in torch.rand(9, 3, generator=rng).tolist()])
     distance = view_distances(cameras)[1]
-    radius = lambda taken: float(distance[list(taken)].amin(0).max())  # noqa: E731
+    radius = lambda taken: float(distance[list(taken)].amin(0).max())
     best = min(radius((0, *rest)) for rest in itertools.combinations(range(1, 9), 2))
     assert radius(choose_views(cameras, 3)) <= 2 * best
 

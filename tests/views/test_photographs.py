@@ -88,7 +88,7 @@ def test_exif_orientation_counts_where_the_cameras_were_calibrated_on_turned_ima
     exif = Image.Exif()
     exif[0x0112] = 6  # the camera was turned: the first row of the file is the right side of the upright image
     lens = {} if w is None else {"w": w, "h": h, "cx": 140.0 * w / 300, "cy": 0.5 * h}
-    upright = lambda mask: np.rot90(mask, -1) if turned else mask  # noqa: E731
+    upright = lambda mask: np.rot90(mask, -1) if turned else mask
     capture(tmp_path / "phone", 400, 300, (100, 50, 300, 250), exif=exif, mask_at=upright, **lens)
     views = load_views(tmp_path / "phone")
     note = next(n for n in views.notes if "EXIF orientation 6" in n)
