@@ -19,7 +19,7 @@ from reli3d.capture.fusion import fused_masks, shown_pixels
 from reli3d.capture.mapping import Map, View, map_photos
 from reli3d.capture.masks import grabcut_mask, is_empty, key_mask, moving_region, touches_border
 from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
-from reli3d.capture.rigidity import Frame, Group, epipolar_fit, inside_mask, rigid_groups
+from reli3d.capture.rigidity import Frame, Group, completed_groups, epipolar_fit, inside_mask, rigid_groups
 from reli3d.capture.scene import Scene, find_scene
 from reli3d.capture.sheet import contact_sheet
 from reli3d.errors import InputError, printable
@@ -308,7 +308,8 @@ def _refined(
     Where matches inside the masks do not fit the cameras, or the masks disagree, their features are mapped alone.  If
     the two maps differ by more than a similarity, and these features fit the second one better, the object was moved
     relative to its surroundings.  The first map, if matches outside the masks fit it, still has the better lenses, and
-    the better cameras within each group of views between which the object stayed in its place.  Otherwise the masks are
+    the better cameras within each group of views between which the object stayed in its place; views that the second
+    one lacks join the group that their matches fit.  Otherwise the masks are
     fused; those that agree lose what the fused ones lack, as contact shadows.
     """
     first = segmented.found
@@ -334,6 +335,11 @@ def _refined(
             same = replace(second, views=tuple(by_name[v.photo.name] for v in second.views))
             report.epipolar_fit = min(report.epipolar_fit, epipolar_fit(same, segmented.masks, between=groups))
             after = epipolar_fit(second, segmented.masks, between=groups)
+        if lenses and len(groups) > 1 and len(second.views) < len(views):
+            groups = completed_groups(first, groups, segmented.masks)
+            unseen = {name for group in groups for name in group.names} - {v.photo.name for v in second.views}
+            added = (replace(v, pixels=v.pixels[:0], points=v.points[:0]) for v in views if v.photo.name in unseen)
+            second = replace(second, views=(*second.views, *added))  # posed by their groups below
     if (
         second is None
         or len(second.views) < KEPT_FRACTION * len(first.views)

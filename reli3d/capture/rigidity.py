@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,6 +16,7 @@ CONFIDENCE = 0.999  # of RANSAC
 GROUP_TURN = np.cos(np.radians(3.0))  # between rotations of the views of a group
 GROUP_ERROR = 0.02  # of the distance to the middle of the cameras, of positions in a group
 SMALLEST_GROUP = 3  # views
+LEAST_JOINING = 0.5  # of the matches with views in groups: the motions of groups are less exact than poses
 
 
 def epipolar_fit(
@@ -31,25 +32,39 @@ def epipolar_fit(
     """
     group_of = {name: k for k, group in enumerate(between or ()) for name in group.names}
     fitting, best = 0, 0
+    for first, second, x, y, own in _matches(found, masks, inside):
+        if between is not None and group_of.get(first.photo.name, -1) == group_of.get(second.photo.name, -2):
+            continue
+        best += int(np.count_nonzero(own))
+        fitting += int(_fits(x, y, first, second).sum())
+    return fitting / best if best else 1.0
+
+
+def _matches(found: Map, masks: dict[str, np.ndarray], inside: bool) -> Iterator[tuple]:
+    """Pairs of views, normalized coordinates of their matches inside (outside) the masks, and which of these fit one
+    essential matrix; only pairs of at least FEWEST_MATCHES that do.
+    """
     for a, b, pixels_a, pixels_b in found.matches:
         first, second = found.views[a], found.views[b]
         if first.photo.name not in masks or second.photo.name not in masks:
-            continue
-        if between is not None and group_of.get(first.photo.name, -1) == group_of.get(second.photo.name, -2):
             continue
         kept = inside_mask(masks[first.photo.name], pixels_a) == inside
         kept &= inside_mask(masks[second.photo.name], pixels_b) == inside
         if kept.sum() < FEWEST_MATCHES:
             continue
         x, y = first.normalized(pixels_a[kept]), second.normalized(pixels_b[kept])
-        limit = EPIPOLAR_ERROR * max(first.photo.size) / min(first.focal, second.focal)
         cv2.setRNGSeed(0)
-        _, own = cv2.findEssentialMat(x, y, np.eye(3), cv2.RANSAC, CONFIDENCE, limit)
-        if own is None or np.count_nonzero(own) < FEWEST_MATCHES:  # wrong matches alone fit some matrix, too
-            continue
-        best += int(np.count_nonzero(own))
-        fitting += int((_sampson(x, y, _essential(first, second)) < limit).sum())
-    return fitting / best if best else 1.0
+        _, own = cv2.findEssentialMat(x, y, np.eye(3), cv2.RANSAC, CONFIDENCE, _limit(first, second))
+        if own is not None and np.count_nonzero(own) >= FEWEST_MATCHES:  # wrong matches alone fit some matrix, too
+            yield first, second, x, y, own[:, 0] > 0
+
+
+def _limit(a: View, b: View) -> float:
+    return EPIPOLAR_ERROR * max(a.photo.size) / min(a.focal, b.focal)
+
+
+def _fits(x: np.ndarray, y: np.ndarray, a: View, b: View) -> np.ndarray:
+    return _sampson(x, y, _essential(a, b)) < _limit(a, b)
 
 
 def inside_mask(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -124,7 +139,7 @@ def rigid_groups(first: Map, second: Map) -> list[Group]:
                     best = fits
         if best.sum() < SMALLEST_GROUP:
             break
-        scale, turn, shift = _similarity(a[best], b[best])
+        scale, turn, shift = _similarity(a[best], b[best], turns[best])
         if np.median(np.linalg.norm(scale * a[best] @ turn.T + shift - b[best], axis=1)) > limit:
             break
         groups.append(Group(scale, turn, shift, tuple(p[0].photo.name for p, k in zip(pairs, best, strict=True) if k)))
@@ -132,11 +147,35 @@ def rigid_groups(first: Map, second: Map) -> list[Group]:
     return groups
 
 
-def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation and shift that take the points ``a (N, 3)`` to ``b`` with the least squares (Umeyama 1991)."""
+def completed_groups(first: Map, groups: Sequence[Group], masks: dict[str, np.ndarray]) -> list[Group]:
+    """``groups`` with those views of ``first``, in none of them, whose matches inside the masks fit the motion of one.
+
+    Matches that fit one essential matrix for a pair of views count, and only those with views that are in a group
+    already.  A view joins the group that the most of them fit, if it is LEAST_JOINING of them.
+    """
+    pairs = list(_matches(first, masks, True))
+    poses = [{v.photo.name: group.moved(v) for v in first.views} for group in groups]
+    group_of = {name: k for k, group in enumerate(groups) for name in group.names}
+    while True:
+        fits: dict[str, list] = {v.photo.name: [] for v in first.views if v.photo.name not in group_of}
+        for a, b, x, y, own in pairs:
+            for one, other, p, q in ((a, b, x[own], y[own]), (b, a, y[own], x[own])):
+                if (name := one.photo.name) in fits and (known := group_of.get(other.photo.name)) is not None:
+                    fits[name].append([_fits(p, q, pose[name], poses[known][other.photo.name]) for pose in poses])
+        rates = {name: np.concatenate(found, 1).mean(1) for name, found in fits.items() if found}
+        joined = {name: int(rate.argmax()) for name, rate in rates.items() if rate.max() >= LEAST_JOINING}
+        if not joined:
+            return [replace(g, names=tuple(n for n, at in group_of.items() if at == k)) for k, g in enumerate(groups)]
+        group_of |= joined
+
+
+def _similarity(a: np.ndarray, b: np.ndarray, turns: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation and shift from ``a (N, 3)`` to ``b``: the mean of ``turns (N, 3, 3)``, which are more exact than
+    positions, and the least squares with it.
+    """
+    u, _, vt = np.linalg.svd(turns.mean(0))
+    turn = u @ vt
     a0, b0 = a.mean(0), b.mean(0)
-    u, s, vt = np.linalg.svd((b - b0).T @ (a - a0))
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    turn = u @ sign @ vt
-    scale = float((s * np.diag(sign)).sum() / ((a - a0) ** 2).sum())
+    moved = (a - a0) @ turn.T
+    scale = float((moved * (b - b0)).sum() / (moved**2).sum())
     return scale, turn, b0 - scale * turn @ a0

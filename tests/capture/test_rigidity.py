@@ -10,7 +10,7 @@ import pytest
 
 from reli3d.capture import capture as function
 from reli3d.capture.mapping import Map, View
-from reli3d.capture.rigidity import Group, epipolar_fit, rigid_groups
+from reli3d.capture.rigidity import Group, completed_groups, epipolar_fit, rigid_groups
 from reli3d.capture.scene import Scene
 from reli3d.errors import InputError
 from tests.support.mapped import SIZE, view
@@ -64,6 +64,23 @@ def test_matches_on_a_moved_object_do_not_fit_the_cameras(moved):
     passes = [Group(1.0, np.eye(3), np.zeros(3), tuple(str(k) for k in part)) for part in (range(6), range(6, 12))]
     between = epipolar_fit(found, masks, between=passes)
     assert between < 0.5 if moved else between > 0.97
+
+
+def test_views_join_the_group_whose_motion_their_matches_fit():
+    """The object is moved after six of twelve views and lies elsewhere in the last; three views are in each group."""
+    found, masks = object_map(True)
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (60, 3))
+    elsewhere = found.views[11].project(turned(points, -50))[0]
+    masks["11"] = hull_mask(elsewhere)
+    matches = [(a, b, x, np.concatenate([elsewhere, y[60:]]) if b == 11 else y) for a, b, x, y in found.matches]
+    turn = (turned(np.eye(3), 30) - [0.2, 0.1, 0]).T
+    groups = [
+        Group(1.0, np.eye(3), np.zeros(3), ("0", "1", "2")),
+        Group(1.0, turn.T, -turn.T @ [0.2, 0.1, 0], ("6", "7", "8")),
+    ]
+    got = completed_groups(replace(found, matches=tuple(matches)), groups, masks)
+    assert [set(g.names) for g in got] == [{str(k) for k in part} for part in (range(6), range(6, 11))]
+    assert [(g.scale, g.turn.tolist()) for g in got] == [(g.scale, g.turn.tolist()) for g in groups]
 
 
 def test_wrong_matches_alone_are_no_motion():
