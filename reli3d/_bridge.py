@@ -246,7 +246,7 @@ class _Once(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *_):
-        raise RuntimeError("second derivative: expected a first one, this function is once_differentiable")
+        raise RuntimeError("second derivatives are not supported")
 
 
 def once_differentiable(backward):

@@ -169,6 +169,7 @@ def bake(
                 arguments.append(_interpolated(values, corner, weight))
             found = fn(*arguments)
             found = {"value": found} if isinstance(found, Tensor) else found
+            expect("fn()", found, dict)
             if maps and found.keys() != maps.keys():
                 raise ValueError(f"fn(): expected {', '.join(maps)} as before, got {', '.join(found)}")
             for name, value in found.items():

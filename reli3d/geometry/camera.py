@@ -194,6 +194,8 @@ def look_at(
     for name, value in zip(("eye", "target", "up"), given, strict=True):
         check(name, value, last=3, like=given[0])
     origin, aim, above = torch.broadcast_tensors(*given)
+    if bool((origin == aim).all(-1).any()):
+        raise ValueError("eye, target: expected different points, got equal ones")
     z = normalize(origin - aim, dim=-1)
     x = torch.linalg.cross(normalize(above, dim=-1), z)
     if origin.numel() and float(x.norm(dim=-1).min()) < 1e-6:  # sine of the angle; float32 noise is 1e-7

@@ -52,7 +52,7 @@ class Mesh(Movable):
                 check(name, value, shape=(len(self.vertices), last), like=self.vertices)
 
     def with_normals(self) -> "Mesh":
-        """The same mesh with :func:`vertex_normals`."""
+        """The same mesh with :func:`~reli3d.geometry.mesh.vertex_normals`."""
         return replace(self, normals=vertex_normals(self.vertices, self.faces))
 
     def with_tangents(self) -> "Mesh":

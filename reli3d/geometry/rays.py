@@ -107,8 +107,8 @@ class RayScene:
         if vertices is None:
             vertices = self.vertices
         else:
-            check("vertices", vertices, like=self.faces)
-            if vertices.shape != self.vertices.shape or not torch.equal(vertices.detach(), self.vertices):
+            check("vertices", vertices, shape=self.vertices.shape, like=self.faces)
+            if not torch.equal(vertices.detach(), self.vertices):
                 raise ValueError(
                     "vertices: expected the positions of the scene, got others; call refit(vertices) first"
                 )

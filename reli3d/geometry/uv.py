@@ -62,6 +62,7 @@ def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
     texture_size: 16 to 16384 texels per side; determines the gaps between charts, see
     :func:`~reli3d.geometry.uv.guard_band`.  Vertices are split at chart borders; faces keep their order, and each has
     positive UV area.  Normals are kept, or computed before the split: shading stays smooth across charts.
+    Hard edges need separate vertices.
     Accepts any triangle mesh: open, non-manifold, disconnected, with degenerate faces.  Deterministic.
 
     Gradients pass through vertices and normals; ``uv`` has none.  Raises TypeError for a wrong type; ValueError for no

@@ -30,7 +30,7 @@ def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None)
     center.  notes: receives one line for every conversion, clamping or ignored header field.  Raises InputError for a
     broken file, NaN, a shape other than 2:1, or more than 8192 x 4096 pixels.
 
-    >>> light = reli3d.read_environment("studio.hdr").rotated(math.pi / 2)
+    >>> light = reli3d.read_environment("studio.hdr").rotated(1.57)
     >>> image = reli3d.render_asset(asset, camera, light)
     """
     image = read_hdr_image(path, notes=notes)

@@ -53,7 +53,7 @@ class _Reader(io.BufferedReader):
 def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tuple[Tensor, Tensor | None]:
     """Reads color ``(H, W, 3)`` in [0, 1], sRGB-encoded as stored, and straight alpha ``(H, W)`` in [0, 1] or None.
 
-    Formats, ``notes`` and errors as in :func:`decode_image`.
+    Formats, ``notes`` and errors as in :func:`~reli3d.io.images.decode_image`.
 
     >>> reli3d.write_image("gray.png", torch.full((4, 4, 3), 0.5))
     >>> color, alpha = reli3d.read_image("gray.png")

@@ -69,8 +69,9 @@ class Render:
     ) -> Tensor:
         """Display values in [0, 1]: ``(H, W, 4)`` with straight alpha, or ``(H, W, 3)`` if not ``transparent``.
 
-        For screens: :func:`write_image` would encode it again.  exposure: in stops.  tone: transform from linear
-        radiance to display values.  transparent: use False for images rendered with ``background="environment"``.
+        For screens: :func:`write_image` would encode it again; for a file, scale the color of ``rgba`` instead.
+        exposure: in stops.  tone: transform from linear radiance to display values.  transparent: use False for images
+        rendered with ``background="environment"``.
         """
         radiance = self.radiance * 2.0**exposure
         if transparent:  # tone mapping is nonlinear and needs straight color
@@ -139,6 +140,9 @@ def render_lights(
     if background not in ("transparent", "environment"):
         raise ValueError(f"background: expected transparent or environment, got {background}")
     scene = scene if scene is not None else joined_scene(parts)
+    expect("scene", scene, RayScene)
+    if supersampling < 1:
+        raise ValueError(f"supersampling: expected at least 1, got {supersampling}")
     fine = camera.scaled(supersampling)
     band = max(1, BAND_RAYS // (fine.width * supersampling)) * supersampling
     bands = []

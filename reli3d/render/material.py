@@ -32,12 +32,13 @@ def eval_bsdf(
     """Metallic-roughness BSDF ``(..., 3)`` [1/sr], without the cosine; 0 if ``wo`` or ``wi`` is below the horizon.
 
     wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha: ``(...)`` GGX width,
-    ``roughness**2``.  metallic: ``(...)`` in [0, 1].  Leading axes broadcast.  diffuse_model: ``conserving`` (albedo at
-    most 1) or ``published`` (ReLi3D's shader; glTF 2.0, appendix B), see ``reli3d.kernels.bsdf``.
+    ``roughness**2``.  metallic: ``(...)`` in [0, 1].  Leading axes broadcast.  diffuse_model: ``conserving`` (the
+    specular layer attenuates the diffuse one; albedo at most 1) or ``published`` (ReLi3D's shader; glTF 2.0, appendix
+    B; creates energy at grazing views).
 
     Gradients reach all five tensors; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless
     float32, ValueError for a wrong shape, device or model.  Source: glTF 2.0; GGX of Walter et al. 2007 with Smith's
-    height-correlated masking.
+    height-correlated masking-shadowing.
 
     >>> up, half = torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.5)
     >>> value = reli3d.eval_bsdf(up, torch.full((3,), 0.8), half, half, up)
@@ -76,10 +77,11 @@ def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") ->
     """Density ``(...)`` [1/sr] of :func:`sample_bsdf` at ``wi``; 0 below the horizon.
 
     wo, wi: ``(..., 3)`` unit, local frame.  alpha: tensor ``(...)``, GGX width.  Leading axes broadcast.  lobe: as in
-    :func:`sample_bsdf`.  No gradient, so detach ``wi`` to differentiate an estimate; :func:`pdf_ggx_vndf` has
-    gradients.  The density can be 0: clamp it before dividing.  For ``visible`` and ``cosine`` clamping adds no bias,
-    because the BSDF is also 0 wherever the density is 0.  An estimate with ``mirrored`` alone is biased: combine it
-    with ``visible``.  Raises TypeError unless float32, ValueError for a wrong shape or device, or an unknown lobe.
+    :func:`sample_bsdf`.  No gradient: to differentiate an estimate, detach ``wi`` too, which fixes the directions;
+    :func:`pdf_ggx_vndf` has gradients.  The density can be 0: clamp it before dividing.  For ``visible`` and ``cosine``
+    clamping adds no bias, because the BSDF is also 0 wherever the density is 0.  An estimate with ``mirrored`` alone is
+    biased: combine it with ``visible``.  Raises TypeError unless float32, ValueError for a wrong shape or device, or an
+    unknown lobe.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u)
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi)

@@ -80,7 +80,7 @@ def antithetic(u: Tensor) -> Tensor:
     float32, ValueError for a wrong shape.
 
     >>> partners = reli3d.antithetic(u)
-    >>> first, second = (reli3d.sample_bsdf(wo, alpha, v) for v in (u, partners))
+    >>> first, second = (reli3d.sample_bsdf(wo, alpha, v) for v in (u, partners))  # the estimate is the mean of both
     """
     check("u", u, last=2)
     turn, height = u.unbind(-1)

@@ -53,12 +53,12 @@ class Samples(NamedTuple):
 class ShadeOptions:
     """Options of :func:`shade`: sampling and material model; raises ValueError or TypeError.
 
-    samples: :class:`Samples`, or three counts, 0 for none.  seed: of the noise; change it in every optimization
-    step.  The squared residual of one noisy image is biased; multiply the residuals of two seeds.  antithetic:
-    pairs of visible-normal samples: ``opposite`` (see :func:`reli3d.antithetic`), ``mirrored`` (ReLi3D), ``none``.
-    heuristic: ``balance`` or ``power``.  sequence: ``halton``, rotated per point and strategy, or ``random``.  alpha:
-    GGX width, ``squared`` roughness or, as in ReLi3D, ``linear``.  diffuse_model: see :func:`reli3d.eval_bsdf`.  clamp:
-    limit per channel of a sample's contribution, MIS weight included.  check_inputs: ValueError for unnormalized
+    samples: :class:`Samples`, or three counts, 0 for none.  seed: random seed; change it in every optimization step.
+    The squared residual of one noisy image is biased; multiply the residuals of two seeds.  antithetic: pairs of VNDF
+    samples: ``opposite`` (see :func:`reli3d.antithetic`), ``mirrored`` (ReLi3D), ``none``.  heuristic: ``balance`` or
+    ``power``.  sequence: ``halton`` with a Cranley-Patterson rotation per point and strategy, or ``random``.  alpha:
+    GGX alpha from roughness, ``squared`` or, as in ReLi3D, ``linear``.  diffuse_model: see :func:`reli3d.eval_bsdf`.
+    clamp: limit per channel of a sample's contribution, MIS weight included.  check_inputs: ValueError for unnormalized
     directions, materials outside [0, 1], non-finite values.
 
     >>> fast = reli3d.ShadeOptions(samples=(4, 4, 2), seed=1)
@@ -105,12 +105,14 @@ def shade(
 ) -> Tensor:
     """Reflected radiance ``(N, 3)`` of surface points towards ``wo`` under ``environment``; linear Rec. 709.
 
-    wo: ``(N, 3)`` unit, world frame, minus the camera ray's direction, or one row.  Back faces are shaded like front
-    faces.  scene: occluders; None: no shadows.  pixels: ``(N,)`` int32, seeds each point's samples with
-    ``options.seed``; None: the row.  Non-finite inputs give NaN.
+    wo: ``(N, 3)`` or ``(3,)``, unit, world frame: minus the direction of the camera ray.  Surfaces are two-sided.  A
+    shading normal that faces away from ``wo`` is adjusted towards it.  scene: occluders; None: no shadows.  pixels:
+    ``(N,)`` int32, selects each point's random numbers together with ``options.seed``; None: the row number.
+    Non-finite inputs give NaN.
 
-    Gradients, once differentiable, reach normal (its tangential component), base_color, roughness, metallic
-    and the environment's texels, at constant directions, densities, MIS weights and visibility.  Bitwise reproducible.
+    First derivatives reach normal, base_color, roughness, metallic and the environment's texels, at constant
+    directions, densities, MIS weights and visibility.  Only the tangential component of the normal's gradient is
+    meaningful: optimize ``normalize(x)``, which removes the rest.  Bitwise reproducible.
     Raises TypeError for a wrong type or dtype, ValueError for a wrong shape or device.  Source: Veach and Guibas 1995;
     :func:`reli3d.eval_bsdf`.
 
@@ -236,6 +238,8 @@ def shaded_arrays(
     expect("options", options, ShadeOptions)
     position = points.position
     check("environment.radiance", environment.radiance, like=position)
+    if scene is not None:
+        expect("scene", scene, RayScene)
     if scene is not None and scene.device != position.device:
         raise ValueError(f"scene: expected device {position.device}, got {scene.device}")
     wo, width = of_rows("wo", wo, position, 3), options.width(points.roughness)

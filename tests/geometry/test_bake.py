@@ -190,6 +190,8 @@ def test_faults_are_named(sphere):
         bake(Mesh(sphere.vertices, sphere.faces, uv=sphere.uv + 3.0), 16, lambda p, n: p)
     with pytest.raises(ValueError, match=r"fn\(\)\['value'\]: expected shape"):
         bake(sphere, 16, lambda p, n: p[:1])
+    with pytest.raises(TypeError, match=r"fn\(\): expected dict, got NoneType"):
+        bake(sphere, 16, lambda p, n: None)
     names = iter(("base", "base", "other"))
     with pytest.raises(ValueError, match=r"fn\(\): expected base as before, got other"):
         bake(sphere, 16, lambda p, n: {next(names): p}, chunk=64)

@@ -225,6 +225,8 @@ def test_intersect_is_closest_with_gradients_in_rays_and_vertices(device):
         scene.intersect(o, d, vertices=scene.vertices.double())
     with pytest.raises(ValueError, match="vertices: expected the positions of the scene"):
         scene.intersect(o, d, vertices=v + 1.0)
+    with pytest.raises(ValueError, match=r"vertices: expected shape \(.*, 3\), got"):
+        scene.intersect(o, d, vertices=v[1:])
     with pytest.raises(TypeError, match="faces: expected a tensor"):
         RayScene(v)
 

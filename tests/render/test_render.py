@@ -14,7 +14,8 @@ from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.image import render_asset, render_lights
-from reli3d.render.shading import ShadeOptions
+from reli3d.render.points import SurfacePoints
+from reli3d.render.shading import ShadeOptions, shade
 from tests.support.scenes import ball, eye, textures
 
 
@@ -181,10 +182,19 @@ def test_bad_input_is_named(device):
     for call, message in (
         (lambda: render_asset(asset, camera), "environment: expected"),
         (lambda: render_asset(asset, camera, light, background="pink"), "background: expected"),
+        (lambda: render_asset(asset, camera, light, supersampling=0), "supersampling: expected"),
+        (lambda: look_at(vertices[0], vertices[0]), "eye, target: expected different points"),
         (lambda: interpolate(vertices, faces, outside, bary), "face: expected"),
         (lambda: sample_texture(asset.textures.normal, bary * math.nan), "uv: expected"),
     ):
         with pytest.raises(ValueError, match=message):
+            call()
+    points = SurfacePoints(vertices, vertices, vertices, 0.5, 0.5, 0.0)
+    for call in (
+        lambda: render_asset(asset, camera, light, scene=asset.mesh),
+        lambda: shade(points, vertices, light, scene=asset.mesh),
+    ):
+        with pytest.raises(TypeError, match="scene: expected RayScene, got Mesh"):
             call()
 
 
