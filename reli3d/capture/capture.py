@@ -309,8 +309,8 @@ def _refined(
     the two maps differ by more than a similarity, and these features fit the second one better, the object was moved
     relative to its surroundings.  The first map, if matches outside the masks fit it, still has the better lenses, and
     the better cameras within each group of views between which the object stayed in its place; views that the second
-    one lacks join the group that their matches fit.  Otherwise the masks are
-    fused; those that agree lose what the fused ones lack, as contact shadows.
+    one lacks join the group that their matches fit.  Otherwise the masks are fused; those that agree lose what the
+    fused ones lack, as contact shadows.
     """
     first = segmented.found
     down = np.stack([v.rotation[1] for v in first.views]).mean(0)

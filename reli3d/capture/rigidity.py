@@ -148,10 +148,11 @@ def rigid_groups(first: Map, second: Map) -> list[Group]:
 
 
 def completed_groups(first: Map, groups: Sequence[Group], masks: dict[str, np.ndarray]) -> list[Group]:
-    """``groups`` with those views of ``first``, in none of them, whose matches inside the masks fit the motion of one.
+    """``groups``, extended by views of ``first`` that are in none of them.
 
-    Matches that fit one essential matrix for a pair of views count, and only those with views that are in a group
-    already.  A view joins the group that the most of them fit, if it is LEAST_JOINING of them.
+    A view joins the group under whose motion the largest fraction of its matches with views in groups fits, if that is
+    LEAST_JOINING or more.  Only matches inside the masks count that fit one essential matrix for their pair of views.
+    Repeated until no view joins.
     """
     pairs = list(_matches(first, masks, True))
     poses = [{v.photo.name: group.moved(v) for v in first.views} for group in groups]
