@@ -302,15 +302,14 @@ def _still_region(view: View, support: np.ndarray, mask: np.ndarray | None) -> n
 def _refined(
     segmented: _Segmented, scene: Scene, known: dict | None, report: CaptureReport, progress: Progress
 ) -> tuple[_Segmented, np.ndarray, float | None]:
-    """The map in whose frame the object does not move, with its masks; in that frame the upward direction ``(3,)`` and
-    the ground's height along it (None: unknown).
+    """The map in whose frame the object does not move, with its masks; in it the upward direction ``(3,)`` and the
+    ground's height along it (None: unknown).
 
     Where matches inside the masks do not fit the cameras, or the masks disagree, their features are mapped alone.  If
     the two maps differ by more than a similarity, and these features fit the second one better, the object was moved
     relative to its surroundings.  The first map, if matches outside the masks fit it, still has the better lenses, and
-    the better cameras within each group of views between which the object stayed in its place; views that the second
-    one lacks join the group that their matches fit.  Otherwise the masks are fused; those that agree lose what the
-    fused ones lack, as contact shadows.
+    the better cameras within each group of views between which the object did not move.  Otherwise the masks are fused;
+    those that agree lose what the fused ones lack, as contact shadows.
     """
     first = segmented.found
     down = np.stack([v.rotation[1] for v in first.views]).mean(0)

@@ -59,14 +59,13 @@ def _check(mesh: Mesh, texture_size: int) -> None:
 def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
     """Adds an atlas to a mesh: ``uv (V', 2)`` in [0, 1], u right, v down, without overlap.
 
-    texture_size: 16 to 16384 texels per side; determines the gaps between charts, see
+    texture_size: 16 to 16384 texels per side; sets the gaps between charts, see
     :func:`~reli3d.geometry.uv.guard_band`.  Vertices are split at chart borders; faces keep their order, and each has
-    positive UV area.  Normals are kept, or computed before the split: shading stays smooth across charts.
-    Hard edges need separate vertices.
-    Accepts any triangle mesh: open, non-manifold, disconnected, with degenerate faces.  Deterministic.
+    positive UV area.  Normals are kept, or computed before the split: shading stays smooth across charts,
+    and hard edges need separate vertices.  Any triangle mesh is accepted.  Deterministic.
 
     Gradients pass through vertices and normals; ``uv`` has none.  Raises TypeError for a wrong type; ValueError for no
-    faces, non-finite vertices, or a texture size out of range or too small for the charts.
+    faces, non-finite vertices, or a texture size out of range or too small.
 
     >>> charted = reli3d.unwrap(mesh, texture_size=64)
     >>> maps = reli3d.bake(charted, 64, lambda position, normal: position.abs())

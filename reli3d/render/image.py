@@ -95,9 +95,8 @@ def render_asset(
     """Renders ``asset``, or several that shadow each other, under an environment with direct lighting and shadows.
 
     Without textures: a dielectric with base color and roughness 0.5.  environment: None: the first of an asset.
-    supersampling: k x k camera rays per pixel, each with all samples.  background: ``transparent`` or ``environment``
-    (then save ``radiance``, not ``rgba``).  scene: rays against all meshes, concatenated in order; None: built in each
-    call.
+    supersampling: k x k rays per pixel, each with all samples.  background: ``transparent`` or ``environment``
+    (then save ``radiance``, not ``rgba``).  scene: of all meshes, concatenated in order; None: built in each call.
 
     Gradients as in :func:`surface_points` and :func:`shade`, at constant hits and visibility; depth's also reach the
     camera; silhouettes' need :func:`antialias`.  Raises TypeError for a wrong type; ValueError without environment or

@@ -33,8 +33,7 @@ def eval_bsdf(
 
     wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha: ``(...)`` GGX width,
     ``roughness**2``.  metallic: ``(...)`` in [0, 1].  Leading axes broadcast.  diffuse_model: ``conserving`` (the
-    specular layer attenuates the diffuse one; albedo at most 1) or ``published`` (ReLi3D's shader; glTF 2.0, appendix
-    B; creates energy at grazing views).
+    specular layer attenuates the diffuse one) or ``published`` (ReLi3D; glTF 2.0, appendix B; can exceed albedo 1).
 
     Gradients reach all five tensors; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless
     float32, ValueError for a wrong shape, device or model.  Source: glTF 2.0; GGX of Walter et al. 2007 with Smith's

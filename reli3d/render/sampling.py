@@ -74,13 +74,13 @@ def antithetic(u: Tensor) -> Tensor:
     """Random numbers ``(..., 2)`` of the antithetic partners of visible-normal samples drawn with ``u (..., 2)``.
 
     ``((u1 + 1/2) mod 1, 1 - 2^-24 - u2)``: the partner is on the opposite side of the lobe.  Uniform if ``u`` is.  For
-    multiples of 2^-24 the map is exact and its own inverse.  The mean of a pair has less variance than that of two
-    independent samples if the partners' values are negatively correlated, as are derivatives with respect to ``alpha``
-    or the normal.  Samplers treat ``u`` as a constant, so gradients are not needed.  Raises TypeError unless
+    multiples of 2^-24 the map is exact and its own inverse.  The estimate is the mean of a pair; it has less variance
+    than that of two independent samples if the partners' values are negatively correlated, as are derivatives with
+    respect to ``alpha`` or the normal.  No gradient: samplers treat ``u`` as a constant.  Raises TypeError unless
     float32, ValueError for a wrong shape.
 
     >>> partners = reli3d.antithetic(u)
-    >>> first, second = (reli3d.sample_bsdf(wo, alpha, v) for v in (u, partners))  # the estimate is the mean of both
+    >>> first, second = (reli3d.sample_bsdf(wo, alpha, v) for v in (u, partners))
     """
     check("u", u, last=2)
     turn, height = u.unbind(-1)

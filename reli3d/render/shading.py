@@ -105,16 +105,14 @@ def shade(
 ) -> Tensor:
     """Reflected radiance ``(N, 3)`` of surface points towards ``wo`` under ``environment``; linear Rec. 709.
 
-    wo: ``(N, 3)`` or ``(3,)``, unit, world frame: minus the direction of the camera ray.  Surfaces are two-sided.  A
-    shading normal that faces away from ``wo`` is adjusted towards it.  scene: occluders; None: no shadows.  pixels:
-    ``(N,)`` int32, selects each point's random numbers together with ``options.seed``; None: the row number.
-    Non-finite inputs give NaN.
+    wo: ``(N, 3)`` or ``(3,)`` unit, world frame, to the camera.  Surfaces are two-sided; shading normals that face away
+    from ``wo`` are adjusted.  scene: occluders; None: no shadows.  pixels: ``(N,)`` int32, seeds each point's samples
+    with ``options.seed``; None: the row number.  Non-finite inputs give NaN.
 
-    First derivatives reach normal, base_color, roughness, metallic and the environment's texels, at constant
-    directions, densities, MIS weights and visibility.  Only the tangential component of the normal's gradient is
-    meaningful: optimize ``normalize(x)``, which removes the rest.  Bitwise reproducible.
-    Raises TypeError for a wrong type or dtype, ValueError for a wrong shape or device.  Source: Veach and Guibas 1995;
-    :func:`reli3d.eval_bsdf`.
+    First derivatives reach normal (tangential component only: optimize ``normalize(x)``), base_color,
+    roughness, metallic and the environment's texels, at constant directions, densities, MIS weights and visibility.
+    Bitwise reproducible.  Raises TypeError for a wrong type or dtype, ValueError for a wrong shape or device.  Source:
+    Veach and Guibas 1995.
 
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
     >>> radiance = reli3d.shade(points, wo, reli3d.Environment.constant(torch.ones(3)))
