@@ -109,10 +109,9 @@ def shade(
     from ``wo`` are adjusted.  scene: occluders; None: no shadows.  pixels: ``(N,)`` int32, seeds each point's samples
     with ``options.seed``; None: the row number.  Non-finite inputs give NaN.
 
-    First derivatives reach normal (tangential component only: optimize ``normalize(x)``), base_color,
+    First derivatives reach normal (only the tangential component is meaningful: optimize ``normalize(x)``), base_color,
     roughness, metallic and the environment's texels, at constant directions, densities, MIS weights and visibility.
-    Bitwise reproducible.  Raises TypeError for a wrong type or dtype, ValueError for a wrong shape or device.  Source:
-    Veach and Guibas 1995.
+    Bitwise reproducible.  Raises TypeError (type, dtype) or ValueError (shape, device).  Source: Veach and Guibas 1995.
 
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
     >>> radiance = reli3d.shade(points, wo, reli3d.Environment.constant(torch.ones(3)))
