@@ -504,15 +504,25 @@ def _check(report: CaptureReport) -> None:
     registered = report.registered / report.images
     error = report.reprojection_error
     checks = (
-        (registered >= LEAST_REGISTERED, f"{100 * registered:.0f} % of the images registered, at least 80 % expected"),
+        (
+            registered >= LEAST_REGISTERED,
+            f"{100 * registered:.0f} % of the images registered, at least 80 % expected; {SMALL_STEPS}",
+        ),
         (error < MOST_ERROR, f"reprojection error {error} px, below 1 expected"),
         (
             report.epipolar_fit >= LEAST_FIT,
             f"{100 * report.epipolar_fit:.0f} % of the matches on the object fit the cameras, at least 80 % expected: "
             "the object was moved relative to its surroundings",
         ),
-        (report.gap < WIDEST_GAP, f"no view within a sector of {math.floor(report.gap)} degrees, at most 60 expected"),
-        (report.object_points >= LEAST_POINTS, f"{report.object_points} points on the object, at least 200 expected"),
+        (
+            report.gap < WIDEST_GAP,
+            f"no view within a sector of {math.floor(report.gap)} degrees, at most 60 expected; add images from there",
+        ),
+        (
+            report.object_points >= LEAST_POINTS,
+            f"{report.object_points} points on the object, at least 200 expected: it lacks texture, or is not the same "
+            "object in all images",
+        ),
         (
             report.agreement >= LEAST_AGREEMENT,
             f"the visual hull fills {100 * report.agreement:.0f} % of a mask, at least 85 % expected: masks lack "

@@ -10,6 +10,18 @@ from dataclasses import dataclass, field
 from tqdm import tqdm
 
 
+@dataclass(frozen=True)
+class Part:
+    """A part of a fit, which ends once the fraction ``until`` of the whole budget is used.
+
+    min_steps: with fewer steps it may take half as much time again.
+    """
+
+    name: str
+    until: float
+    min_steps: int = 0
+
+
 @dataclass
 class Budget:
     """Budget in seconds or steps for the parts of a fit; only ``steps`` gives the same result on every run.
@@ -45,22 +57,23 @@ class Budget:
             style = {"unit": "s" if self.seconds else "steps", "bar_format": layout, "leave": False}
             self.bar = tqdm(total=self.limit, file=sys.stderr, disable=None, **style)
 
-    def part(self, name: str, until: float) -> Iterator[tuple[int, float]]:
-        """Yields ``(step, progress)``, progress in [0, 1), until the fraction ``until`` of the whole budget is used.
+    def take(self, part: Part) -> Iterator[tuple[int, float]]:
+        """Yields ``(step, progress)`` of a part, progress in [0, 1].
 
         With a budget in seconds, progress follows the clock.  A part that would begin after its end takes no step.
         """
-        count = self.counts[name] = 0
-        start, end = self.spent(), self.limit * until
+        count = self.counts[part.name] = 0
+        start, end = self.spent(), self.limit * part.until
         end = round(end) if self.steps else end
         while True:
             self.interrupted |= self.interrupt is not None and self.interrupt()
             now = self.spent()
-            if self.interrupted or now >= end:
+            late = now >= end and (count >= part.min_steps or now >= end + 0.5 * (end - start))
+            if self.interrupted or late:
                 return
-            yield count, (now - start) / (end - start)
+            yield count, min((now - start) / max(end - start, 1e-9), 1.0)
             count += 1
-            self.counts[name] = count
+            self.counts[part.name] = count
 
     def spent(self) -> float:
         """Steps, or seconds with a budget in seconds."""

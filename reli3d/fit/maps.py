@@ -11,7 +11,7 @@ from torch import Tensor
 from reli3d._bridge import present
 from reli3d.fit import losses
 from reli3d.fit.bounce import reflected
-from reli3d.fit.budget import Budget
+from reli3d.fit.budget import Budget, Part
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.lighting import Lights, radiance
 from reli3d.fit.unknowns import Start, Unknowns, bent, material_change, material_logits, material_of
@@ -149,15 +149,14 @@ def fit_maps(
     data: FixedSurface,
     weights: losses.Weights,
     budget: Budget,
-    name: str,
-    until: float,
+    part: Part,
     *,
     seed: int,
     detail: bool = True,
 ) -> None:
     """Fits lighting, exposures and material on a fixed surface, coarse to fine.
 
-    name, until: of the budget's part.  detail: fit the texture detail and the bend of the normals as well.
+    detail: fit the texture detail and the bend of the normals as well.
 
     Errors of normals, shadows and interreflection would be baked into the base color.  While the material is fitted, a
     weakly regularized bend of the shading normals absorbs these errors.  Then the material is frozen, and the bend is
@@ -178,7 +177,7 @@ def fit_maps(
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     first, settled = 0, False
     free, kept = weights.free_bend * len(data.used), weights.bend / len(data.used) ** 2
-    for step, progress in budget.part(name, until):
+    for step, progress in budget.take(part):
         if detail and progress >= MATERIAL_UNTIL and not settled:
             settled = True
             for value in (*unknowns.material, unknowns.detail):
@@ -196,7 +195,7 @@ def fit_maps(
         optimizer.zero_grad()  # to None: Adam skips frozen tensors
         loss.backward()
         optimizer.step()
-        budget.record(name, step, float(loss.detach()))
+        budget.record(part.name, step, float(loss.detach()))
     for group in optimizer.param_groups:
         group["params"][0].requires_grad_(False)
     if not settled:  # interrupted

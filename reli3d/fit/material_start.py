@@ -9,14 +9,14 @@ from dataclasses import replace
 import torch
 
 from reli3d.fit import losses
-from reli3d.fit.budget import Budget
+from reli3d.fit.budget import Budget, Part
 from reli3d.fit.maps import PIXELS_PER_STEP, SHADING_SAMPLES, FixedSurface, fit_maps, maps_loss, traced
 from reli3d.fit.unknowns import Unknowns
 from reli3d.geometry.rays import RayScene
 
 TRIAL_ROUGHNESS = 0.25
 TRIAL_METALLIC = {"metal": 0.95, "nonmetal": 0.05}
-TRIAL = 0.08  # fraction of the budget for each of the three fits
+TRIAL = 0.08  # fraction of the budget for each of the three fits; 0.12 for MIN_STEPS
 # Ratio to the start's error up to which the nonmetal is preferred if it fits better than the metal: half metals fit
 # images of nonmetals almost as well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for glossy
 # nonmetals, 1.10 to 1.29 for others; for a painted metal 0.99 to 1.02, where the metal does not always fit better.
@@ -73,8 +73,9 @@ def best_material_start(
     for name in errors:
         if name in TRIAL_METALLIC:
             fits[name] = deepcopy(plain), with_metallic(data, TRIAL_METALLIC[name])
-        fit_maps(*fits[name], weights, budget, f"trial of {name}", budget.used() + TRIAL, seed=seed)
-        if budget.counts[f"trial of {name}"] < MIN_STEPS:
+        part = Part(f"trial of {name}", budget.used() + TRIAL, MIN_STEPS)
+        fit_maps(*fits[name], weights, budget, part, seed=seed)
+        if budget.counts[part.name] < MIN_STEPS:
             break
         errors[name] = sum(image_error(*fits[name], views, seed) for views in (data.used, held))
     if errors["nonmetal"] < errors["metal"]:

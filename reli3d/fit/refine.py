@@ -9,10 +9,10 @@ from dataclasses import asdict, dataclass, field, replace
 import torch
 from torch import Tensor
 
-from reli3d._bridge import full_precision
+from reli3d._bridge import full_precision, load_modules
 from reli3d.fit import losses
 from reli3d.fit.bounce import gathered
-from reli3d.fit.budget import Budget
+from reli3d.fit.budget import Budget, Part
 from reli3d.fit.choice import UNCHANGED, Fitted, Parts, chosen, mean_psnr, view_errors
 from reli3d.fit.input_images import InputImages, PosedImages
 from reli3d.fit.light_frame import light_follows_camera
@@ -23,6 +23,7 @@ from reli3d.fit.shape import ShapeData, empty, finished, fit_shape, start_grid
 from reli3d.fit.transfer import transfer_textures
 from reli3d.fit.unknowns import START_GRID, Start, Unknowns, corrected, filled_grid
 from reli3d.geometry.mesh import watertight
+from reli3d.kernels import cache, flexicubes_adjoint, shade_adjoint  # noqa: F401 # they are compiled before the fit
 from reli3d.render.asset import Asset
 
 RESOLUTION = 128  # cells along the longest side
@@ -122,6 +123,10 @@ def refine(
     """
     images = InputImages.of(views, options.light)
     _check_asset(asset, images)
+    device = images.color.device
+    kernels = cache.imported(device.type)
+    if not cache.compiled(kernels, device.type):  # it takes up to half a minute, which is not part of the budget
+        load_modules(kernels, device)
     budget = Budget(seconds, steps, bar, interrupt)
     held = held_out(len(images))
     used = [v for v in range(len(images)) if v not in held]
@@ -168,7 +173,7 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
     if closed:
         grid, sdf, bound = start_grid(first.mesh, images, options.resolution)
     unknowns = Unknowns.zero(sdf, len(images), min(MAX_DETAIL_TEXELS, texels), max(images.light_group) + 1)
-    fit_maps(unknowns, data, weights, budget, "light", LIGHT_UNTIL, seed=seed, detail=False)
+    fit_maps(unknowns, data, weights, budget, Part("light", LIGHT_UNTIL), seed=seed, detail=False)
     if closed:
         around = filled_grid(first.mesh.vertices, data.received, START_GRID)
         shape = ShapeData.of(start, sdf, bound, grid, around, images, used)
@@ -189,7 +194,7 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
         if data.asset is not surface:
             kind = "metal" if float(data.asset.textures.metallic.mean()) > 0.5 else "nonmetal"
             notes.append(f"roughness and metallic are fitted from those of a glossy {kind}")
-    fit_maps(unknowns, data, weights, budget, "maps", 1.0, seed=seed)
+    fit_maps(unknowns, data, weights, budget, Part("maps", 1.0), seed=seed)
     return Fitted(first, surface, data.received, start, unknowns, images, data.asset)
 
 

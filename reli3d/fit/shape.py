@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate, max_pool3d
 
 from reli3d.fit import losses
 from reli3d.fit.bounce import reflected
-from reli3d.fit.budget import Budget
+from reli3d.fit.budget import Budget, Part
 from reli3d.fit.facets import flattened
 from reli3d.fit.fields import EvenAdam, blurred_grid
 from reli3d.fit.input_images import InputImages
@@ -274,7 +274,7 @@ def fit_shape(
 ) -> None:
     """Optimizes ``unknowns.sdf`` jointly with material, lighting and exposures.
 
-    until: fraction of the budget used at the end.  cameras: also optimize the poses.  Ends where the surface is empty.
+    until: of the budget's part.  cameras: also optimize the poses.  Ends where the surface is empty.
     """
     surface = EvenAdam(unknowns.sdf)
     rates = {"material": 0.03, "light": 0.02, "exposure": 0.01, **({"pose": 0.0} if cameras else {})}
@@ -282,7 +282,7 @@ def fit_shape(
     groups = [{"params": changed[name], "lr": rate} for name, rate in rates.items()]
     others = torch.optim.Adam(groups, betas=(0.9, 0.99))
     variables = [unknowns.sdf, *(value for values in changed.values() for value in values)]
-    for step, progress in budget.part("shape", until):
+    for step, progress in budget.take(Part("shape", until)):
         if empty(unknowns.sdf, data.bound):
             break
         for value in variables:

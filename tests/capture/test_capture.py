@@ -70,13 +70,24 @@ def test_cameras_are_those_of_the_scene(ground_truth, captured):
     assert report.object_points > 400  # 456; 361 if each pair of images judges its matches by its own geometry
 
 
+@pytest.mark.slow
 def test_two_runs_write_equal_files(ground_truth, captured, tmp_path):
-    """Neither numbers of images nor random numbers depend on the threads of COLMAP."""
     _, folder = captured
     capture(ground_truth.write(tmp_path / "photographs"), tmp_path / "object")
     files = [p.relative_to(folder) for p in sorted(folder.rglob("*")) if p.is_file()]
     assert len(files) > 30
     assert all((folder / p).read_bytes() == (tmp_path / "object" / p).read_bytes() for p in files)
+
+
+def test_two_maps_are_equal(ground_truth, tmp_path):
+    """Neither numbers of images nor random numbers depend on the threads of COLMAP."""
+    photos, _ = read_photos(ground_truth.write(tmp_path / "photographs"), lambda *_: None)
+    one, two = (map_photos(photos[:8], lambda *_: None) for _ in range(2))
+    assert len(one.views) == 8 and one.matches
+    for a, b in zip((one, *one.views), (two, *two.views), strict=True):
+        for name, value in vars(a).items():
+            if isinstance(value, (np.ndarray, float)):
+                assert np.array_equal(value, getattr(b, name)), name
 
 
 def test_features_inside_masks_give_no_distortion_and_cameras_that_fit_all_points(ground_truth, tmp_path):

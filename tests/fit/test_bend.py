@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from reli3d.fit import maps
-from reli3d.fit.budget import Budget
+from reli3d.fit.budget import Budget, Part
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights
 from reli3d.fit.maps import FixedSurface
@@ -46,7 +46,7 @@ def unchanged() -> Unknowns:
 def fitted(start, images, weights: Weights, steps: int = 24, unknowns: Unknowns | None = None) -> Unknowns:
     unknowns = unknowns or unchanged()
     data = FixedSurface(Start.of(start), start, torch.zeros_like(start.mesh.vertices), images, list(range(VIEWS)))
-    maps.fit_maps(unknowns, data, weights, Budget(steps=steps), "maps", 1.0, seed=0)
+    maps.fit_maps(unknowns, data, weights, Budget(steps=steps), Part("maps", 1.0), seed=0)
     return unknowns
 
 

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from reli3d.fit import light_frame, maps
 from reli3d.fit.bounce import gathered
-from reli3d.fit.budget import Budget
+from reli3d.fit.budget import Budget, Part
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.light_frame import explained_deviations, light_follows_camera
 from reli3d.fit.lighting import Lights
@@ -57,8 +57,8 @@ def fitted(views, light, steps: int = STEPS) -> tuple:
     first = replace(small_scene.ball(), environment=Environment(torch.full((16, 32, 3), 0.5)))
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS, max(images.light_group) + 1)
     data = FixedSurface(Start.of(first), first, gathered(first.mesh, images, seed=0), images, list(range(VIEWS)))
-    budget = Budget(steps=steps)
-    maps.fit_maps(unknowns, data, Weights(), budget, "light", 1.0, seed=0, detail=False)  # and the base color's grids
+    part = Budget(steps=steps), Part("light", 1.0)
+    maps.fit_maps(unknowns, data, Weights(), *part, seed=0, detail=False)  # and the base color's grids
     return changed(first, unknowns), Lights.of(unknowns, data.start, images)
 
 

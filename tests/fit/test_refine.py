@@ -1,6 +1,9 @@
 """Refinement: recovers a known scene, is never worse than its start, and is deterministic."""
 
+import itertools
 import math
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -10,7 +13,7 @@ from torch.nn.functional import normalize
 from reli3d._bridge import mapped
 from reli3d.fit import refine as fit
 from reli3d.fit import transfer
-from reli3d.fit.budget import Budget
+from reli3d.fit.budget import Budget, Part
 from reli3d.fit.choice import PSNR_TOLERANCE_DB, Fitted, Parts
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import LIGHT_PRIOR_VIEWS, Weights, agreement, display_error, hue_drift, palette, priors
@@ -22,6 +25,8 @@ from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.views.views import Views
 from tests.support import small_scene
+from tests.support.checkout import ROOT
+from tests.support.processes import ENVIRONMENT
 
 SIZE, VIEWS, STEPS = 48, 6, 60
 ALL = Parts(1.0, 1.0, 1.0)
@@ -186,9 +191,37 @@ def test_what_does_not_fit_together_is_refused(start, views):
 
 def test_steps_are_divided_among_the_parts():
     budget = Budget(steps=10)
-    parts = [[p for _, p in budget.part(name, until)] for name, until in (("a", 0.2), ("b", 0.5), ("c", 1.0))]
+    parts = [[p for _, p in budget.take(Part(name, until))] for name, until in (("a", 0.2), ("b", 0.5), ("c", 1.0))]
     assert [len(p) for p in parts] == [2, 3, 5]
     assert all(p == sorted(p) and p[0] >= 0.0 and p[-1] < 1.0 for p in parts)
+
+
+def test_a_slow_part_may_last_half_as_long_again(monkeypatch):
+    for least, steps in ((0, 9), (12, 12), (99, 14)):
+        clock = itertools.count()  # a second between two calls
+        monkeypatch.setattr("time.perf_counter", lambda c=clock: float(next(c)))
+        budget = Budget(seconds=100.0, began=0.0)
+        assert len(list(budget.take(Part("a", 0.1, least)))) == steps
+        assert sum(1 for _ in budget.take(Part("b", 0.3))) == 27 - steps  # its end stays; three calls make no step
+
+
+KERNELS_OF_A_FIT = """
+import sys
+from reli3d.fit.refine import refine
+from tests.support import small_scene
+ball = small_scene.ball()
+views = small_scene.input_views(ball, 2, 16)
+before = set(sys.modules)
+refine(ball, views, steps=10)
+print(*(name for name in set(sys.modules) - before if name.startswith("reli3d.kernels")))
+"""
+
+
+def test_kernels_are_imported_before_the_fit():
+    """Those that a backward pass imports would be compiled within the budget."""
+    call = [sys.executable, "-c", KERNELS_OF_A_FIT]
+    done = subprocess.run(call, env=ENVIRONMENT, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
 
 
 def test_the_squared_error_of_noisy_estimates_has_no_bias():
