@@ -21,6 +21,9 @@ TRIAL = 0.08  # fraction of the budget for each of the three fits; 0.12 for MIN_
 # images of nonmetals almost as well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for glossy
 # nonmetals, 1.10 to 1.29 for others; for a painted metal 0.99 to 1.02, where the metal does not always fit better.
 PREFERENCE = 1.05
+# Ratio to the start's error from which the metal is taken.  It is 0.975 to 1.19 for objects of metal, whose starts are
+# metallic, and 0.98 for one of plastic and steel, of which it makes a metal throughout.
+METAL_GAIN = 0.97
 MIN_STEPS = 30  # of each fit; after fewer, the start that needs fewer changes has the smaller error
 MIN_BASE_COLOR = 0.02
 CHECK_BATCHES = 4
@@ -61,8 +64,9 @@ def best_material_start(
 
     From a rough or half metallic start, descent can end in a local minimum, with too high roughness and a lighting
     without highlights.  The error is the sum of the means over fitted views and over ``held``, indices of the held-out
-    views.  The nonmetal's may be ``PREFERENCE`` times the start's if it is below the metal's.  After fewer than
-    ``MIN_STEPS`` steps of a fit the next ones are left out.  seed: of pixels and light samples.
+    views.  The nonmetal's may be ``PREFERENCE`` times the start's if it is below the metal's; the metal's must be below
+    ``METAL_GAIN`` times the start's.  After fewer than ``MIN_STEPS`` steps of a fit the next ones are left out.  seed:
+    of pixels and light samples.
     """
     if budget.steps is not None and TRIAL * budget.steps < MIN_STEPS:
         return unknowns, data
@@ -80,4 +84,5 @@ def best_material_start(
         errors[name] = sum(image_error(*fits[name], views, seed) for views in (data.used, held))
     if errors["nonmetal"] < errors["metal"]:
         errors["nonmetal"] /= PREFERENCE
+    errors["metal"] /= METAL_GAIN
     return fits[min(errors, key=lambda name: errors[name])]

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from reli3d.fit import material_start
 from reli3d.fit.bounce import gathered
 from reli3d.fit.budget import Budget
 from reli3d.fit.input_images import InputImages
@@ -37,3 +38,19 @@ def test_a_glossy_nonmetal_is_found_and_a_metal_is_not_taken_for_one(metallic):
     data = FixedSurface(Start.of(start), start, gathered(start.mesh, images, seed=0), images, used)
     _, best = best_material_start(unknowns, data, held, Weights(), Budget(steps=STEPS), seed=0)
     assert (float(best.asset.textures.metallic.mean()) < 0.1) == (metallic == 0.0)
+
+
+@pytest.mark.parametrize(
+    "errors, metallic",
+    [((1.0, 0.98, 1.1), 0.5), ((1.0, 0.95, 1.1), 0.95), ((1.0, 1.06, 1.04), 0.05), ((1.0, 1.03, 1.04), 0.5)],
+)
+def test_the_start_is_left_for_a_metal_that_fits_better_and_a_nonmetal_that_fits_as_well(monkeypatch, errors, metallic):
+    first = small_scene.ball()
+    first = replace(first, textures=replace(first.textures, metallic=0.5))
+    images = InputImages.of(small_scene.input_views(first, 2, 8))
+    unknowns = Unknowns.zero(torch.ones(2, 2, 2), 2, small_scene.TEXELS)
+    data = FixedSurface(Start.of(first), first, gathered(first.mesh, images, seed=0), images, [0, 1])
+    found = iter(e / 2 for e in errors for _ in range(2))  # of fitted and of held-out views
+    monkeypatch.setattr(material_start, "image_error", lambda *_: next(found))
+    _, best = best_material_start(unknowns, data, [], Weights(), Budget(steps=STEPS), seed=0)
+    assert float(best.asset.textures.metallic.mean()) == pytest.approx(metallic)
