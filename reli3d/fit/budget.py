@@ -71,7 +71,7 @@ class Budget:
             late = now >= end and (count >= part.min_steps or now >= end + 0.5 * (end - start))
             if self.interrupted or late:
                 return
-            yield count, min((now - start) / max(end - start, 1e-9), 1.0)
+            yield count, min((now - start) / (end - start), 1.0)
             count += 1
             self.counts[part.name] = count
 

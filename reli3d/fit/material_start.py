@@ -21,8 +21,8 @@ TRIAL = 0.08  # fraction of the budget for each of the three fits; 0.12 for MIN_
 # images of nonmetals almost as well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for glossy
 # nonmetals, 1.10 to 1.29 for others; for a painted metal 0.99 to 1.02, where the metal does not always fit better.
 PREFERENCE = 1.05
-# Ratio to the start's error from which the metal is taken.  It is 0.975 to 1.19 for objects of metal, whose starts are
-# metallic, and 0.98 for one of plastic and steel, of which it makes a metal throughout.
+# Ratio to the start's error below which the metal is taken.  It is 0.975 to 1.19 for objects of metal, whose starts are
+# metallic, and 0.98 for an object of plastic and steel, which the metal's fit makes metallic everywhere.
 METAL_GAIN = 0.97
 MIN_STEPS = 30  # of each fit; after fewer, the start that needs fewer changes has the smaller error
 MIN_BASE_COLOR = 0.02

@@ -274,7 +274,7 @@ def fit_shape(
 ) -> None:
     """Optimizes ``unknowns.sdf`` jointly with material, lighting and exposures.
 
-    until: of the budget's part.  cameras: also optimize the poses.  Ends where the surface is empty.
+    until: of :class:`~reli3d.fit.budget.Part`.  cameras: also optimize the poses.  Ends where the surface is empty.
     """
     surface = EvenAdam(unknowns.sdf)
     rates = {"material": 0.03, "light": 0.02, "exposure": 0.01, **({"pose": 0.0} if cameras else {})}
