@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -103,15 +104,14 @@ def maps_loss(
     rows: Tensor,
     weights: losses.Weights,
     *,
-    scene: RayScene | None,
-    samples: tuple[int, int, int],
+    direct: Callable[..., Tensor],
     seed: int,
     independent: bool = True,
 ) -> Tensor:
     """Loss of one step over ``rows`` of the pixels; gradients reach material, detail, bend, light and exposure.
 
-    scene, samples: of :func:`~reli3d.fit.lighting.radiance`.  seed: of the light samples.  independent: as in
-    :func:`~reli3d.fit.losses.estimated_error`.
+    direct: :func:`~reli3d.fit.lighting.radiance` with its samples and scene.  seed: of the light samples.  independent:
+    as in :func:`~reli3d.fit.losses.estimated_error`.
     """
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
     detail = sample_texture(unknowns.detail, pixels.uv[rows])
@@ -123,8 +123,7 @@ def maps_loss(
     bounced = reflected(points, pixels.received[rows])
 
     def lit(seed: int) -> Tensor:
-        shading = partial(radiance, samples=samples, scene=scene, seed=seed)
-        return (bounced + lights.evaluate(points, pixels.wo[rows], view, shading)) * exposure
+        return (bounced + lights.evaluate(points, pixels.wo[rows], view, partial(direct, seed=seed))) * exposure
 
     loss = weights.image * losses.estimated_error(lit, target, seed, independent)
     colors = points.base_color, material_of(pixels.logits[rows])[0]
@@ -189,9 +188,9 @@ def fit_maps(
         end = first + min(PIXELS_PER_STEP, count)
         rows = pixels.order[torch.arange(first, end, device=pixels.order.device, dtype=torch.int64) % count]
         first = (first + PIXELS_PER_STEP) % count
-        samples = SHADING_SAMPLES[0] if progress < 0.5 else SHADING_SAMPLES[1]
+        direct = partial(radiance, samples=SHADING_SAMPLES[progress >= 0.5], scene=scene)
         own = replace(weights, bend=kept if settled else free)
-        loss = maps_loss(unknowns, data, pixels, rows, own, scene=scene, samples=samples, seed=seed * 1_000_003 + step)
+        loss = maps_loss(unknowns, data, pixels, rows, own, direct=direct, seed=seed * 1_000_003 + step)
         optimizer.zero_grad()  # to None: Adam skips frozen tensors
         loss.backward()
         optimizer.step()

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 
 import torch
 
 from reli3d.fit import losses
 from reli3d.fit.budget import Budget, Part
+from reli3d.fit.lighting import radiance
 from reli3d.fit.maps import PIXELS_PER_STEP, SHADING_SAMPLES, FixedSurface, fit_maps, maps_loss, traced
 from reli3d.fit.unknowns import Unknowns
 from reli3d.geometry.rays import RayScene
@@ -51,9 +53,9 @@ def image_error(unknowns: Unknowns, data: FixedSurface, views: list[int], seed: 
     scene = RayScene(data.asset.mesh.vertices, data.asset.mesh.faces)
     pixels = traced(replace(data, used=views), scene, seed)
     total, order = 0.0, pixels.order[: CHECK_BATCHES * PIXELS_PER_STEP]
+    direct = partial(radiance, samples=SHADING_SAMPLES[1], scene=scene)
     for k, rows in enumerate(order.split(PIXELS_PER_STEP)):
-        part = unknowns, data, pixels, rows, IMAGE_ONLY
-        total += len(rows) * float(maps_loss(*part, scene=scene, samples=SHADING_SAMPLES[1], seed=seed + k))
+        total += len(rows) * float(maps_loss(unknowns, data, pixels, rows, IMAGE_ONLY, direct=direct, seed=seed + k))
     return total / max(len(order), 1)
 
 

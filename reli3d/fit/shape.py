@@ -208,7 +208,8 @@ def shape_loss(
     loss = weights.curvature * (squared_laplacian(unknowns.sdf, data.smooth) / (grid.cell * grid.cell))
     loss = loss + weights.sdf_change / views * moved.square().mean()
     loss = loss + weights.outline * _outlines(unknowns, data, mesh, scene, rng)
-    return loss + _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent)
+    error = partial(losses.estimated_error, seed=seed, independent=independent)
+    return loss + _colors(unknowns, data, mesh, scene, weights, progress, rng, error)
 
 
 def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, rng) -> Tensor:
@@ -223,7 +224,7 @@ def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, 
     return total / len(chosen)
 
 
-def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent) -> Tensor:
+def _colors(unknowns, data, mesh, scene, weights, progress, rng, error) -> Tensor:
     planes = data.planes[min(int(progress * len(data.planes)), len(data.planes) - 1)]
     size, images = planes.shape[-1], data.images.select(data.colored)
     camera = corrected(images.camera.resized(size, size), unknowns.pose[data.colored])
@@ -254,7 +255,7 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
         shading = partial(radiance, samples=SHADING_SAMPLES, scene=scene, seed=seed)
         return (bounced + lights.evaluate(points, wo, view, shading)) * exposure
 
-    loss = loss + weights.shading * losses.estimated_error(lit, target, seed, independent)
+    loss = loss + weights.shading * error(lit, target)
     # the same ratio of the terms as in the fit of the maps
     logs = points.base_color.clamp(min=losses.MIN_LINEAR).log()
     loss = loss + weights.shading * weights.palette * losses.palette(logs, target)

@@ -33,10 +33,10 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
         ) from error
     if not bool(torch.isfinite(mesh.vertices.detach()).all()):
         raise ValueError("mesh.vertices: expected finite positions, got NaN or infinity")
-    triangles, sound = welded_faces(mesh)
+    first, label = weld(mesh.vertices)
+    triangles, sound = welded_faces(mesh, label)
     if not sound.any():
         raise ValueError("mesh: expected faces with three different corners, got none")
-    first, _ = weld(mesh.vertices)
     whole = _used(mesh.vertices.detach()[first].cpu().numpy(), triangles[sound])
     if len(whole.faces) <= faces:
         return whole.to(mesh.vertices.device)

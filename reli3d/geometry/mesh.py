@@ -127,10 +127,10 @@ def weld(vertices: Tensor) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(first).to(vertices.device), torch.from_numpy(label).to(vertices.device)
 
 
-def welded_faces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Faces over welded labels, and which of them are not degenerate."""
-    _, label = weld_rows(mesh.vertices.detach().cpu().numpy())
-    faces = label[mesh.faces.cpu().numpy()].reshape(-1, 3)
+def welded_faces(mesh: Mesh, label: Tensor | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Faces over welded labels, and which of them are not degenerate.  label: of :func:`weld`, if known."""
+    label = weld(mesh.vertices)[1] if label is None else label
+    faces = label.cpu().numpy()[mesh.faces.cpu().numpy()].reshape(-1, 3)
     a, b, c = faces.T
     return faces, (a != b) & (b != c) & (c != a)
 

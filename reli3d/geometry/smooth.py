@@ -38,7 +38,7 @@ class _Umbrella:
 def _umbrella(mesh: Mesh) -> _Umbrella:
     first, label = weld(mesh.vertices)
     n = len(first)
-    faces, sound = welded_faces(mesh)
+    faces, sound = welded_faces(mesh, label)
     edges = edges_of(faces[sound])
     lead = edges.order[edges.start]
     ends = np.stack([edges.tail[lead], edges.head[lead]])

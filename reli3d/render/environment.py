@@ -3,6 +3,7 @@
 Mapping as in :mod:`reli3d.render.latlong`: upper edge +Y, horizontal center +X, +Z right of the center.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -59,10 +60,11 @@ class Environment(Movable):
             raise ValueError(f"radiance: expected (H, W, 3), got {tuple(self.radiance.shape)}")
 
     @classmethod
-    def constant(cls, rgb: Tensor, height: int = 16) -> "Environment":
-        """Uniform lighting with radiance ``rgb (3,)``."""
-        check("rgb", rgb, last=3)
-        return cls(rgb.expand(height, 2 * height, 3).contiguous())
+    def constant(cls, rgb: Tensor | Sequence[float], height: int = 16) -> "Environment":
+        """Uniform lighting with radiance ``rgb (3,)``, a tensor or numbers."""
+        color = rgb if isinstance(rgb, Tensor) else torch.as_tensor(rgb, dtype=torch.float32)
+        check("rgb", color, shape=(3,))
+        return cls(color.expand(height, 2 * height, 3).contiguous())
 
     def lookup(self, directions: Tensor) -> Tensor:
         """Radiance ``(..., 3)`` from unit ``directions (..., 3)``: bilinear between texel centers, periodic in azimuth.

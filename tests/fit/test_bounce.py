@@ -95,7 +95,7 @@ def test_a_floor_receives_the_color_of_the_nearer_wall(device):
     torch.testing.assert_close(left, right.flip(0), rtol=0.1, atol=0.01)  # mirror images, 13,000 rays each
 
 
-def test_a_fit_of_maps_includes_interreflection(monkeypatch):
+def test_a_fit_of_maps_includes_interreflection():
     """Without direct light the image is the reflected interreflection times the exposure."""
     asset, images = small_scene.ball(), small_scene.input_views(small_scene.ball(), 3, 32)
     images, mesh = InputImages.of(images), asset.mesh
@@ -104,14 +104,14 @@ def test_a_fit_of_maps_includes_interreflection(monkeypatch):
     pixels = maps.traced(data, RayScene(mesh.vertices, mesh.faces), seed=0)
     base_color, _, metallic = material_of(pixels.logits)
     shown = replace(pixels, target=1.5 * base_color * (1.0 - metallic[:, None]) * pixels.received)
-    monkeypatch.setattr(maps, "radiance", lambda points, *args, **options: torch.zeros_like(points.base_color))
+    dark = lambda points, *args, **options: torch.zeros_like(points.base_color)
     weights = Weights(**{**dict.fromkeys(vars(Weights()), 0.0), "image": 1.0})
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), 3, 8)
     unknowns.exposure += math.log(1.5)
 
     def loss(weight: float, independent: bool) -> float:
         rows = replace(shown, received=weight * pixels.received)
-        options = dict(scene=None, samples=(1, 0, 0), seed=0, independent=independent)
+        options = dict(direct=dark, seed=0, independent=independent)
         return float(maps.maps_loss(unknowns, data, rows, pixels.order, weights, **options))
 
     assert loss(1.0, False) < 1e-10 < 1e-4 < loss(0.5, False)

@@ -6,6 +6,7 @@ cosine alone.  Visibility and viewing directions are constants too: they are com
 """
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from reli3d.fit import maps, shape
 from reli3d.fit.input_images import InputImages
+from reli3d.fit.lighting import radiance
 from reli3d.fit.losses import Weights
 from reli3d.fit.maps import FixedSurface
 from reli3d.fit.unknowns import Start, Unknowns
@@ -103,7 +105,8 @@ def test_the_gradient_of_the_bend_matches_central_differences(terms, monkeypatch
     rng = torch.Generator().manual_seed(3)
     for grid in unknowns.bend:
         grid += 0.1 * torch.randn(grid.shape, generator=rng)
-    weights, options = Weights(**{**NONE, **terms}), dict(scene=None, samples=LIGHT, seed=1, independent=False)
+    weights = Weights(**{**NONE, **terms})
+    options = dict(direct=partial(radiance, samples=LIGHT, scene=None), seed=1, independent=False)
 
     def loss() -> Tensor:
         return maps.maps_loss(unknowns, surface, pixels, pixels.order[:400], weights, **options)

@@ -202,3 +202,12 @@ def test_enlarging_is_periodic_in_azimuth():
     turned = Environment(radiance.roll(5, 1)).resized(24).radiance
     torch.testing.assert_close(turned, larger.roll(15, 1), rtol=0, atol=1e-5)
     torch.testing.assert_close(larger[1::3, 1::3], radiance, rtol=0, atol=1e-5)  # at the centers of the texels
+
+
+def test_constant_lighting_takes_numbers_or_a_tensor():
+    light = Environment.constant([0.5, 1, 2.0], height=4)
+    assert light.radiance.shape == (4, 8, 3) and light.radiance.dtype == torch.float32
+    assert torch.equal(light.radiance, Environment.constant(torch.tensor([0.5, 1.0, 2.0]), height=4).radiance)
+    assert light.radiance[3, 7].tolist() == [0.5, 1.0, 2.0]
+    with pytest.raises(ValueError, match=r"^rgb: expected shape \(3,\), got \(2,\)$"):
+        Environment.constant([0.5, 1.0])
