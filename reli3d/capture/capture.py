@@ -19,7 +19,15 @@ from reli3d.capture.fusion import fused_masks, shown_pixels
 from reli3d.capture.mapping import Map, View, map_photos
 from reli3d.capture.masks import grabcut_mask, is_empty, key_mask, moving_region, touches_border
 from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
-from reli3d.capture.rigidity import Frame, Group, completed_groups, epipolar_fit, inside_mask, rigid_groups
+from reli3d.capture.rigidity import (
+    Frame,
+    Group,
+    completed_groups,
+    epipolar_fit,
+    inside_mask,
+    on_turntable,
+    rigid_groups,
+)
 from reli3d.capture.scene import Scene, find_scene
 from reli3d.capture.sheet import contact_sheet
 from reli3d.errors import InputError, printable
@@ -124,12 +132,14 @@ def capture(
         region = moving_region([p.pixels for p in photos], fixed=bool(options.turntable))
     if options.turntable and region is None:
         raise InputError("turntable", "expected images of one size in which the object turns, got others")
+    known = _known_masks(photos, options, progress)
+    first = map_photos(photos, progress, None if region is None else [region] * len(photos))
+    if region is not None and not options.turntable and not on_turntable(first.views):
+        region, first = None, map_photos(photos, progress)  # a background without texture hid that the camera moves
     if region is not None:
         notes.append("turntable: the camera is fixed and the object turns; the lighting is fixed to the camera")
     if region is not None or 2 * sum(p.flash for p in photos) > len(photos):
         report.lighting = "camera"
-    known = _known_masks(photos, options, progress)
-    first = map_photos(photos, progress, None if region is None else [region] * len(photos))
     scene = find_scene(first)
     segmented = _Segmented(first, _masks(first, scene, known, None, progress))
     if len(segmented.masks) < FEWEST:

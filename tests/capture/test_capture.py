@@ -131,6 +131,13 @@ def test_cameras_of_a_turntable(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_plain_background_does_not_make_a_turntable(tmp_path):
+    plain = render_capture(views=24, plain=True)
+    report = capture(plain.write(tmp_path / "photographs"), tmp_path / "object")
+    assert report.registered >= 22 and report.lighting == "object" and not any("turntable" in n for n in report.notes)
+
+
+@pytest.mark.slow
 def test_cameras_of_an_object_that_is_moved_between_two_passes(tmp_path):
     """A map of all features has positions wrong by 32 % of the distance, at a reprojection error below half a pixel."""
     moved = render_capture(views=40, moved_after=20)

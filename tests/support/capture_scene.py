@@ -82,11 +82,14 @@ def board(azimuth: float, origins, directions, depth) -> tuple[torch.Tensor, tor
     return front, shown[0, :, 0].T
 
 
-def render_capture(views: int, *, heights=(24, 46), moved_after=None, turntable=False, passerby=False) -> TrueCapture:
+def render_capture(
+    views: int, *, heights=(24, 46), moved_after=None, turntable=False, passerby=False, plain=False
+) -> TrueCapture:
     """A ring of hand-held views at two heights [degrees] under a sky; cameras are relative to the object.
 
     moved_after: from this view on the object is elsewhere on the table.  turntable: the camera is fixed, the object
     turns with a small table in front of a textured background.  passerby: something upright moves behind the table.
+    plain: a gray background without texture or shadow.
     """
     rng = np.random.default_rng(0)
     width, height = 400, 300
@@ -125,6 +128,8 @@ def render_capture(views: int, *, heights=(24, 46), moved_after=None, turntable=
             front, color = board(float(azimuth[k] + np.pi + 0.4 * np.sin(1.9 * k)), origins, directions, hits.t)
             image[front] = color
         on_object = (hits.face >= 0) & (hits.face < faces)
+        if plain:
+            image[~on_object] = 0.4
         image = pooled(image.reshape(1, 2 * height, 2 * width, 3).permute(0, 3, 1, 2), 2)[0].permute(1, 2, 0)
         covered = pooled(on_object.float().reshape(1, 2 * height, 2 * width), 2)[0] > 0.5
         images.append((linear_to_srgb((0.6 * image).clamp(0, 1)) * 255 + 0.5).to(torch.uint8).numpy())
