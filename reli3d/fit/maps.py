@@ -24,7 +24,7 @@ from reli3d.render.points import SurfacePoints
 
 PIXELS_PER_STEP = 6144
 SHADING_SAMPLES = ((6, 6, 2), (12, 12, 4))  # of light, BSDF and cosine, in the first and the second half of a stage
-MAX_PIXELS = 400_000  # of all images: 46 MB; of more, a random subset
+MAX_PIXELS = 400_000  # of all images: 51 MB; of more, a random subset
 LEARNING_RATES = {"material": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
 GRID_INTERVAL = 0.1  # of a stage's progress, after which the next finer map or grid is optimized as well
 DETAIL_FROM = 0.35  # progress from which the texture detail is optimized
@@ -51,6 +51,8 @@ class Pixels:
     """Pixels inside the masks and the surface points visible there; N rows."""
 
     view: Tensor
+    face: Tensor
+    bary: Tensor
     position: Tensor
     normal: Tensor
     ng: Tensor
@@ -60,6 +62,11 @@ class Pixels:
     target: Tensor  # (N, 3) linear
     received: Tensor  # (N, 3) of :func:`~reli3d.fit.bounce.gathered`
     order: Tensor  # random permutation; consecutive entries are a uniform sample
+
+    @torch.no_grad()
+    def with_maps(self, asset: Asset) -> Pixels:
+        """The pixels with the material of ``asset``, which has the same surface."""
+        return replace(self, logits=material_logits(surface_points(asset.mesh, asset.textures, self.face, self.bary)))
 
 
 @torch.no_grad()
@@ -94,7 +101,8 @@ def traced(data: FixedSurface, scene: RayScene, seed: int) -> Pixels:
     at = surface_points(mesh, asset.textures, face, bary)
     uv = interpolate(present("mesh.uv", mesh.uv), mesh.faces, face, bary)
     received = interpolate(data.received, mesh.faces, face, bary)
-    return Pixels(which, at.position, at.normal, at.ng, wo, uv, material_logits(at), target, received, order)
+    logits = material_logits(at)
+    return Pixels(which, face, bary, at.position, at.normal, at.ng, wo, uv, logits, target, received, order)
 
 
 def maps_loss(
@@ -152,17 +160,18 @@ def fit_maps(
     *,
     seed: int,
     detail: bool = True,
+    pixels: Pixels | None = None,
 ) -> None:
     """Fits lighting, exposures and material on a fixed surface, coarse to fine.
 
-    detail: fit the texture detail and the bend of the normals as well.
+    detail: fit the texture detail and the bend of the normals as well.  pixels: None: those of :func:`traced`.
 
     Errors of normals, shadows and interreflection would be baked into the base color.  While the material is fitted, a
     weakly regularized bend of the shading normals absorbs these errors.  Then the material is frozen, and the bend is
     reset and fitted again with a stronger prior; only this second bend is kept.
     """
     scene = RayScene(data.asset.mesh.vertices, data.asset.mesh.faces)
-    pixels = traced(data, scene, seed)
+    pixels = traced(data, scene, seed) if pixels is None else pixels
     count = len(pixels.order)
     if count == 0:
         return

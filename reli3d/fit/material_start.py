@@ -12,7 +12,7 @@ import torch
 from reli3d.fit import losses
 from reli3d.fit.budget import Budget, Part
 from reli3d.fit.lighting import radiance
-from reli3d.fit.maps import PIXELS_PER_STEP, SHADING_SAMPLES, FixedSurface, fit_maps, maps_loss, traced
+from reli3d.fit.maps import PIXELS_PER_STEP, SHADING_SAMPLES, FixedSurface, Pixels, fit_maps, maps_loss, traced
 from reli3d.fit.unknowns import Unknowns
 from reli3d.geometry.rays import RayScene
 
@@ -48,10 +48,8 @@ def with_metallic(data: FixedSurface, metallic: float) -> FixedSurface:
 
 
 @torch.no_grad()
-def image_error(unknowns: Unknowns, data: FixedSurface, views: list[int], seed: int) -> float:
-    """:func:`~reli3d.fit.losses.display_error` of at most ``CHECK_BATCHES * PIXELS_PER_STEP`` pixels of ``views``."""
-    scene = RayScene(data.asset.mesh.vertices, data.asset.mesh.faces)
-    pixels = traced(replace(data, used=views), scene, seed)
+def image_error(unknowns: Unknowns, data: FixedSurface, pixels: Pixels, scene: RayScene, seed: int) -> float:
+    """:func:`~reli3d.fit.losses.display_error` of at most ``CHECK_BATCHES * PIXELS_PER_STEP`` of the pixels."""
     total, order = 0.0, pixels.order[: CHECK_BATCHES * PIXELS_PER_STEP]
     direct = partial(radiance, samples=SHADING_SAMPLES[1], scene=scene)
     for k, rows in enumerate(order.split(PIXELS_PER_STEP)):
@@ -75,15 +73,18 @@ def best_material_start(
     plain = deepcopy(unknowns)
     for grid in plain.material:
         grid[..., 3:] = 0.0
+    scene = RayScene(data.asset.mesh.vertices, data.asset.mesh.faces)
+    pixels = [traced(replace(data, used=views), scene, seed) for views in (data.used, held)]
     fits, errors = {"start": (unknowns, data)}, dict.fromkeys(("start", *TRIAL_METALLIC), math.inf)
     for name in errors:
         if name in TRIAL_METALLIC:
             fits[name] = deepcopy(plain), with_metallic(data, TRIAL_METALLIC[name])
         part = Part(f"trial of {name}", budget.used() + TRIAL, MIN_STEPS)
-        fit_maps(*fits[name], weights, budget, part, seed=seed)
+        fitted, check = (some.with_maps(fits[name][1].asset) for some in pixels)
+        fit_maps(*fits[name], weights, budget, part, seed=seed, pixels=fitted)
         if budget.counts[part.name] < MIN_STEPS:
             break
-        errors[name] = sum(image_error(*fits[name], views, seed) for views in (data.used, held))
+        errors[name] = sum(image_error(*fits[name], of_views, scene, seed) for of_views in (fitted, check))
     if errors["nonmetal"] < errors["metal"]:
         errors["nonmetal"] /= PREFERENCE
     errors["metal"] /= METAL_GAIN
