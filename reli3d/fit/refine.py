@@ -27,8 +27,7 @@ from reli3d.kernels import cache, flexicubes_adjoint, shade_adjoint  # noqa: F40
 from reli3d.render.asset import Asset
 
 RESOLUTION = 128  # cells along the longest side
-# Fractions of what remains of the budget at the first step: first the lighting, then the surface, then all maps.
-LIGHT_UNTIL, SHAPE_UNTIL = 0.12, 0.5
+LIGHT_UNTIL, SHAPE_UNTIL = 0.12, 0.5  # fractions of the budget: first the lighting, then the surface, then all maps
 MIN_VIEWS_FOR_TRIALS = 12  # with 8, roughness and metallic improve, but relighting falls by 0.5 dB (six objects)
 MIN_ATLAS_TEXELS = 256  # along a side of the new surface's textures: smaller ones have no room for its charts
 MAX_DETAIL_TEXELS = 512  # along a side of the base color's detail map
@@ -174,13 +173,11 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
     if closed:
         grid, sdf, bound = start_grid(first.mesh, images, options.resolution)
     unknowns = Unknowns.zero(sdf, len(images), min(MAX_DETAIL_TEXELS, texels), max(images.light_group) + 1)
-    used_before = budget.used()
-    light_until, shape_until = (used_before + (1.0 - used_before) * part for part in (LIGHT_UNTIL, SHAPE_UNTIL))
-    fit_maps(unknowns, data, weights, budget, Part("light", light_until), seed=seed, detail=False)
+    fit_maps(unknowns, data, weights, budget, Part("light", LIGHT_UNTIL), seed=seed, detail=False)
     if closed:
         around = filled_grid(first.mesh.vertices, data.received, START_GRID)
         shape = ShapeData.of(start, sdf, bound, grid, around, images, used)
-        fit_shape(unknowns, shape, weights, budget, shape_until, seed=seed, cameras=options.cameras)
+        fit_shape(unknowns, shape, weights, budget, SHAPE_UNTIL, seed=seed, cameras=options.cameras)
         del shape  # 170 MB of 60 images
         if empty(unknowns.sdf, bound):
             notes.append("the masks do not overlap in space, so only maps and lighting are fitted; run reli3d check")
