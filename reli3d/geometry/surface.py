@@ -24,17 +24,21 @@ from reli3d.kernels.flexicubes_tables import tables
 
 @dataclass(frozen=True)
 class CubeWeights:
-    """FlexiCubes' parameters of a grid, float32; None: no offsets, or weights of 1.
+    """FlexiCubes' parameters of a grid of ``(X, Y, Z)`` cubes, float32; None: no offsets, or weights of 1.
+
+    deformation: ``(X+1, Y+1, Z+1, 3)`` offsets of the grid vertices in units of the box's side, 2 radius.  Positive
+    weights: alpha ``(K, 8)`` of corners, beta ``(K, 12)`` of edges, gamma ``(K,)`` of quads.  cubes: ``(K,)`` int64,
+    from :func:`reli3d.geometry.surface.surface_cubes`, the cubes of the rows; None: all, in C order.
 
     >>> sdf = torch.rand(5, 5, 5) - 0.5
     >>> mesh = reli3d.extract_surface(sdf, radius=1.0, weights=reli3d.CubeWeights(beta=torch.ones(64, 12)))
     """
 
-    deformation: Tensor | None = None  # (X + 1, Y + 1, Z + 1, 3) offsets of the grid vertices, fractions of the box
-    alpha: Tensor | None = None  # (K, 8) positive weights of corners
-    beta: Tensor | None = None  # (K, 12) positive weights of edges
-    gamma: Tensor | None = None  # (K,) positive weights of quads
-    cubes: Tensor | None = None  # (K,) int64, from surface_cubes; None: all cubes of the grid
+    deformation: Tensor | None = None
+    alpha: Tensor | None = None
+    beta: Tensor | None = None
+    gamma: Tensor | None = None
+    cubes: Tensor | None = None
 
 
 UNIT_WEIGHTS = CubeWeights()
@@ -83,7 +87,7 @@ def _struct_of_tables(device: torch.device) -> kernels.Tables:
 
 
 def surface_cubes(sdf: Tensor) -> Tensor:
-    """Indices ``(x * Y + y) * Z + z`` of cubes with a sign change, ``(K,)`` int64 ascending; only these have weights.
+    """Indices ``(x * Y + y) * Z + z`` of cubes with a sign change, ``(K,)`` int64 ascending; only their weights count.
 
     sdf: ``(X + 1, Y + 1, Z + 1)`` float32.
     """

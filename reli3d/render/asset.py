@@ -17,9 +17,10 @@ WRAPS = ("repeat", "mirror", "clamp")  # glTF's REPEAT, MIRRORED_REPEAT, CLAMP_T
 class TextureSet(Movable):
     """Metallic-roughness textures of one mesh: square float32 maps of equal size, with values in [0, 1].
 
-    Row 0 is v = 0 (glTF: v down), texel centers at +0.5.  base_color: ``(T, T, 3)``, linear.  roughness (perceptual),
-    metallic: ``(T, T)``, ``(T, T, 1)``, or a Python number.  normal: ``(T, T, 3)``, tangent-space normals as ``n
-    / 2 + 0.5``, green along the bitangent; None: flat.  wrap: along u and v, each ``repeat``, ``mirror`` or ``clamp``.
+    Row 0 is v = 0 (glTF: v down), texel centers at +0.5, bilinear lookup without mipmaps.  base_color: ``(T, T, 3)``,
+    linear.  roughness (perceptual), metallic: ``(T, T)``, ``(T, T, 1)``, or a Python number.  normal: ``(T, T, 3)``,
+    tangent-space normals as ``n / 2 + 0.5``, green along the bitangent; None: flat.  wrap: along u and v, each
+    ``repeat``, ``mirror`` or ``clamp``.
 
     Gradients pass through.  Raises TypeError for a wrong type or dtype, ValueError for a wrong shape, device or wrap
     mode.  Only writers check ranges: clamp optimized maps.

@@ -31,8 +31,8 @@ def eval_bsdf(
 ) -> Tensor:
     """Metallic-roughness BSDF ``(..., 3)`` [1/sr], without the cosine; 0 if ``wo`` or ``wi`` is below the horizon.
 
-    wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha: ``(...)`` GGX width,
-    ``roughness**2``.  metallic: ``(...)`` in [0, 1].  Leading axes broadcast.  diffuse_model: ``conserving`` (the
+    wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha, metallic: tensors
+    ``(...)``, GGX width ``roughness**2`` and [0, 1].  Leading axes broadcast.  diffuse_model: ``conserving`` (the
     specular layer attenuates the diffuse one) or ``published`` (ReLi3D; glTF 2.0, appendix B; can exceed albedo 1).
 
     Gradients reach all five tensors; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless
@@ -50,9 +50,9 @@ def eval_bsdf(
 def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") -> Tensor:
     """Unit directions ``wi (..., 3)`` from one lobe of the BSDF, with the density :func:`pdf_bsdf`.
 
-    wo: ``(..., 3)`` unit, local frame, z > 0, else density 0.  alpha: ``roughness**2``.  u: ``(..., 2)`` uniform in [0,
-    1).  lobe: ``visible`` (``wo`` reflected about a visible normal), ``mirrored`` (about that normal turned by pi; only
-    together with ``visible``, by MIS) or ``cosine``.
+    wo: ``(..., 3)`` unit, local frame, z > 0, else density 0.  alpha: ``(...)``, a tensor, ``roughness**2``.  u:
+    ``(..., 2)`` uniform in [0, 1).  lobe: ``visible`` (``wo`` reflected about a visible normal), ``mirrored`` (about
+    that normal turned by pi; only together with ``visible``, by MIS) or ``cosine``.
 
     Gradients reach ``wo`` and ``alpha``.  Raises TypeError unless float32, ValueError for a wrong shape, device or
     lobe.  Source: Dupuy and Benyoub 2023.

@@ -38,7 +38,7 @@ def broadcast_call(kernel, items: list[tuple[str, Tensor, int]], *plain) -> Tens
         raise ValueError(f"{names}: expected shapes that broadcast, got {got}") from None
     flat = [v.expand(*batch, last).reshape(-1, last) if last else v.expand(batch).reshape(-1) for _, v, last in items]
     (out,) = call(kernel, batch.numel(), [*flat, *plain], [(batch.numel(),)])
-    return out.reshape(*batch, *out.shape[1:])
+    return out.reshape((*batch, *out.shape[1:]))
 
 
 def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
@@ -60,8 +60,8 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
     """Density ``(...)`` [1/sr, in ``wm``] of :func:`sample_ggx_vndf`.
 
     0 unless ``wm . wo``, ``wm.z`` and ``wo.z`` are positive.  wo, wm: ``(..., 3)`` unit, local
-    frame.  alpha: tensor ``(...)``, GGX width ``roughness**2``.  Leading axes broadcast.  Gradients reach ``wo``,
-    ``alpha`` and ``wm``.  Divide by ``4 wo.wm`` for the density of the reflected direction, which may be below the
+    frame.  alpha: as in the sampler, with its floor.  Leading axes broadcast.  Gradients reach ``wo``, ``alpha`` and
+    ``wm``.  Divide by ``4 wo.wm`` for the density of the reflected direction, which may be below the
     surface (where :func:`pdf_bsdf` is 0).  Raises TypeError unless float32, ValueError for a wrong shape or device.
 
     >>> wm = reli3d.sample_ggx_vndf(wo, alpha, u)

@@ -38,7 +38,8 @@ GROUP_RAYS = 64  # of neighboring hits, traced together: so packets of 16 are fu
 class Samples(NamedTuple):
     """Sample counts per point and strategy; the defaults follow the ReLi3D paper.
 
-    light: importance sampling of the environment.  bsdf: GGX visible normals.  cosine: cosine-weighted hemisphere.
+    light: importance sampling of the environment.  bsdf: GGX visible normals, including the partners of antithetic
+    pairs; the last of an odd count has none.  cosine: cosine-weighted hemisphere.
 
     >>> options = reli3d.ShadeOptions(samples=reli3d.Samples(light=8, bsdf=16, cosine=2))
     >>> image = reli3d.render_asset(asset, camera, light, options=options)

@@ -76,6 +76,22 @@ def test_cosine_follows_its_density(device):
     torch.testing.assert_close(got, pdf_cosine(wi), rtol=1e-6, atol=0)  # 1 / pi is rounded
 
 
+def test_one_direction_without_leading_axes_is_a_row_of_many(device):
+    wo, alpha, u = view(40, device), torch.tensor(0.3, device=device), uniform(1, device)[0]
+    wm, wi, color = (f(view(20, device)) for f in (torch.clone, torch.clone, torch.abs))
+    half = torch.full_like(alpha, 0.5)
+    calls = {
+        sample_ggx_vndf: (wo, alpha, u),
+        pdf_ggx_vndf: (wo, alpha, wm),
+        sample_bsdf: (wo, alpha, u),
+        pdf_bsdf: (wo, alpha, wi),
+        eval_bsdf: (wo, color, alpha, half, wi),
+    }
+    for function, values in calls.items():
+        (row,) = function(*(v[None] for v in values))
+        assert torch.equal(function(*values), row), function.__name__
+
+
 def test_opposite_numbers_are_each_of_them_once(device):
     """Of all 2^24 values, on either axis: uniform numbers stay uniform, and twice the map is the identity."""
     every = torch.arange(2**24, dtype=torch.float64, device=device) / 2**24
