@@ -318,8 +318,8 @@ def _refined(
     Where matches inside the masks do not fit the cameras, or the masks disagree, their features are mapped alone.  If
     the two maps differ by more than a similarity, and these features fit the second one better, the object was moved
     relative to its surroundings.  The first map, if matches outside the masks fit it, still has the better lenses, and
-    the better cameras within each group of views between which the object did not move.  Otherwise the masks are fused;
-    those that agree lose what the fused ones lack, as contact shadows.
+    the better cameras within each group of views between which the object did not move.  The masks are fused, those of
+    a moved object by groups; masks of one place that agree only lose what the fused ones lack, as contact shadows.
     """
     first = segmented.found
     down = np.stack([v.rotation[1] for v in first.views]).mean(0)
@@ -371,7 +371,14 @@ def _refined(
     support = None
     if known is None:
         support = {v.photo.name: v.pixels[scene.support[v.points]] for v in first.views}
-    masks = _masks(second, find_scene(second, supported=False), known, support, progress)
+    own = find_scene(second, supported=False)
+    masks = _masks(second, own, known, support, progress)
+    if known is None:  # in the first map, where the support and its shadows do not move within a group
+        for group in (g for g in groups if len(g.names) >= FEWEST):
+            points = group.inverse(second.points[own.object])
+            at = replace(first, views=tuple(by_name[name] for name in group.names), points=points)
+            whole = replace(scene, object=np.ones(len(points), bool))
+            masks |= fused_masks(at, whole, {name: masks[name] for name in group.names if name in masks})
     refined = _Segmented(second, masks)
     if len(masks) < KEPT_FRACTION * len(segmented.masks) or (
         known is None and _agreement(refined.views, masks) < _agreement(again, segmented.masks)
