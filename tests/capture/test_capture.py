@@ -144,6 +144,10 @@ def test_cameras_of_an_object_that_is_moved_between_two_passes(tmp_path):
     report = capture(moved.write(tmp_path / "photographs"), tmp_path / "object")
     assert report.registered == 40 and any("moved" in note for note in report.notes)
     check_cameras(moved, tmp_path / "object")
+    assert len(report.views) == 40  # 38, by their masks, if these are not fused for each place
+    for path in (tmp_path / "object" / "masks").iterdir():
+        got, expected = np.asarray(Image.open(path)) > 127, moved.masks[int(path.stem[:3])]
+        assert (got & expected).sum() / (got | expected).sum() > 0.96  # 0.974
 
 
 @pytest.mark.slow
