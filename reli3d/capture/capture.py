@@ -316,10 +316,10 @@ def _refined(
     ground's height along it (None: unknown).
 
     Where matches inside the masks do not fit the cameras, or the masks disagree, their features are mapped alone.  If
-    the two maps differ by more than a similarity, and these features fit the second one better, the object was moved
-    relative to its surroundings.  The first map, if matches outside the masks fit it, still has the better lenses, and
-    the better cameras within each group of views between which the object did not move.  The masks are fused, those of
-    a moved object by groups; masks of one place that agree only lose what the fused ones lack, as contact shadows.
+    the two maps differ by more than a similarity, and these features fit the second one better, the object was moved.
+    The first map, if matches outside the masks fit it, still has the better lenses, and the better cameras within each
+    group of views between which the object did not move.  The masks are fused, those of a moved object by groups; masks
+    that agree can only lose contact shadows.
     """
     first = segmented.found
     down = np.stack([v.rotation[1] for v in first.views]).mean(0)

@@ -50,7 +50,7 @@ def eval_bsdf(
 def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") -> Tensor:
     """Unit directions ``wi (..., 3)`` from one lobe of the BSDF, with the density :func:`pdf_bsdf`.
 
-    wo: ``(..., 3)`` unit, local frame, z > 0, else density 0.  alpha: ``(...)``, a tensor, ``roughness**2``.  u:
+    wo: ``(..., 3)`` unit, local frame, z > 0, else density 0.  alpha: tensor ``(...)``, ``roughness**2``.  u:
     ``(..., 2)`` uniform in [0, 1).  lobe: ``visible`` (``wo`` reflected about a visible normal), ``mirrored`` (about
     that normal turned by pi; only together with ``visible``, by MIS) or ``cosine``.
 
