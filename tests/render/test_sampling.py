@@ -78,14 +78,13 @@ def test_cosine_follows_its_density(device):
 
 def test_one_direction_without_leading_axes_is_a_row_of_many(device):
     wo, alpha, u = view(40, device), torch.tensor(0.3, device=device), uniform(1, device)[0]
-    wm, wi, color = (f(view(20, device)) for f in (torch.clone, torch.clone, torch.abs))
-    half = torch.full_like(alpha, 0.5)
+    other, half = view(20, device), torch.full_like(alpha, 0.5)
     calls = {
         sample_ggx_vndf: (wo, alpha, u),
-        pdf_ggx_vndf: (wo, alpha, wm),
+        pdf_ggx_vndf: (wo, alpha, other),
         sample_bsdf: (wo, alpha, u),
-        pdf_bsdf: (wo, alpha, wi),
-        eval_bsdf: (wo, color, alpha, half, wi),
+        pdf_bsdf: (wo, alpha, other),
+        eval_bsdf: (wo, other.abs(), alpha, half, other),
     }
     for function, values in calls.items():
         (row,) = function(*(v[None] for v in values))
