@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from PIL import Image
 
-from reli3d.capture.fusion import fused_masks, shown_pixels
-from reli3d.capture.mapping import Map, View, map_photos
+from reli3d.capture.consistency import aligned
+from reli3d.capture.fusion import fused_masks
+from reli3d.capture.mapping import Map, View, map_photos, shown_pixels
 from reli3d.capture.masks import grabcut_mask, is_empty, key_mask, moving_region, touches_border
 from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
 from reli3d.capture.rigidity import (
@@ -318,8 +319,8 @@ def _refined(
     Where matches inside the masks do not fit the cameras, or the masks disagree, their features are mapped alone.  If
     the two maps differ by more than a similarity, and these features fit the second one better, the object was moved.
     The first map, if matches outside the masks fit it, still has the better lenses, and the better cameras within each
-    group of views between which the object did not move.  The masks are fused, those of a moved object by groups; masks
-    that agree can only lose contact shadows.
+    group of views between which the object did not move.  The masks are fused, those of a moved object by groups, whose
+    motions they correct; masks that agree can only lose contact shadows.
     """
     first = segmented.found
     down = np.stack([v.rotation[1] for v in first.views]).mean(0)
@@ -361,11 +362,7 @@ def _refined(
         return segmented, up, ground
     report.epipolar_fit = after
     groups = groups if lenses else []
-    if groups:
-        posed = {v.photo.name: v for v in second.views}
-        for name, pose in ((name, group.moved(by_name[name])) for group in groups for name in group.names):
-            posed[name] = replace(posed[name], rotation=pose.rotation, translation=pose.translation)
-        second = replace(second, views=tuple(posed.values()))
+    second = _posed(second, groups, by_name)
     report.notes.append("the object was moved relative to its surroundings: its own features decide on the cameras")
     again = [v for v in second.views if v.photo.name in segmented.masks]
     support = None
@@ -379,6 +376,7 @@ def _refined(
             at = replace(first, views=tuple(by_name[name] for name in group.names), points=points)
             whole = replace(scene, object=np.ones(len(points), bool))
             masks |= fused_masks(at, whole, {name: masks[name] for name in group.names if name in masks})
+    second = _posed(second, _aligned(groups, by_name, masks), by_name)
     refined = _Segmented(second, masks)
     if len(masks) < KEPT_FRACTION * len(segmented.masks) or (
         known is None and _agreement(refined.views, masks) < _agreement(again, segmented.masks)
@@ -392,6 +390,30 @@ def _refined(
     similar = directions @ directions.T > SAME_UP  # an object that was turned over has two: that of most views is up
     upward = directions[similar[similar.sum(1).argmax()]].mean(0)
     return refined, upward / np.linalg.norm(upward), None
+
+
+def _posed(found: Map, groups: Sequence[Group], views: dict[str, View]) -> Map:
+    """``found`` with the poses of ``views`` in the groups, moved by these."""
+    moved = {name: group.moved(views[name]) for group in groups for name in group.names}
+    poses = [moved.get(v.photo.name, v) for v in found.views]
+    pairs = zip(found.views, poses, strict=True)
+    return replace(found, views=tuple(replace(v, rotation=p.rotation, translation=p.translation) for v, p in pairs))
+
+
+def _aligned(groups: Sequence[Group], views: dict[str, View], masks: dict[str, np.ndarray]) -> list[Group]:
+    """The groups with motions that are corrected, one after the other, by the silhouettes in the groups before."""
+    whole = {name for name, mask in masks.items() if not touches_border(mask)}
+    corrected: list[Group] = []
+    for group in groups:
+        own, before = (
+            [g.moved(views[name]) for g in some for name in g.names if name in whole] for some in ([group], corrected)
+        )
+        if own and before:
+            motion = aligned(_as_views(before, masks), _as_views(own, masks))
+            shift = motion.apply(group.shift)
+            group = replace(group, scale=motion.scale * group.scale, turn=motion.turn @ group.turn, shift=shift)
+        corrected.append(group)
+    return corrected
 
 
 def _c2w(view: View) -> np.ndarray:

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from reli3d.capture.mapping import Map, View, grown
+from reli3d.capture.consistency import completed_masks
+from reli3d.capture.mapping import Map, View, grown, shown_pixels
 from reli3d.capture.masks import COARSE_SIDE, full_size, grabcut, reduced, refined
 from reli3d.capture.rigidity import Frame
 from reli3d.capture.scene import Scene
@@ -66,7 +67,8 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     plane's texture, or elsewhere with the colors around the object.  They give the log odds that a cell of a volume is
     occupied (Franco and Boyer 2005), on which all views have to agree.  From the second pass on, cells below
     SHADOW_HEIGHT do not hide the plane, so that a contact shadow becomes a part of its texture.  Each pass ends with
-    GrabCut from the log odds of the pixels and the volume's silhouettes; the last has larger images.
+    GrabCut from the log odds of the pixels and the volume's silhouettes; the last has larger images.  At the end,
+    :func:`completed_masks`.
     """
     if scene.plane is None:
         return masks
@@ -94,7 +96,8 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
         odds = [_with_prior(s, e, occupied, cell) for s, e in zip(smalls, evidence, strict=True)]
         inside = [_segmented(s.image, o) for s, o in zip(smalls, odds, strict=True)]
     photos = [v.photo for v in views]
-    return {p.name: full_size(refined(p.pixels, m), p.pixels.shape) for p, m in zip(photos, inside, strict=True)}
+    fused = {p.name: full_size(refined(p.pixels, m), p.pixels.shape) for p, m in zip(photos, inside, strict=True)}
+    return completed_masks(views, fused, np.stack([occupied.min(0), occupied.max(0)]))
 
 
 @dataclass(frozen=True)
@@ -257,15 +260,6 @@ def _log_odds(image: np.ndarray, inside: np.ndarray, plane: _Expected, own: _Col
     odds = own.log_density(image) - np.where(plane.known, as_plane, other)
     limit = np.where(plane.known, PLANE_EVIDENCE, COLOR_EVIDENCE)
     return np.clip(cv2.GaussianBlur(np.clip(odds, -8, 8), (0, 0), 1.2), -limit, limit).astype(np.float32)
-
-
-def shown_pixels(
-    pixels: np.ndarray, depth: np.ndarray, shape: tuple[int, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Column and row of the pixels inside an image of ``shape``, and which of ``pixels (N, 2)`` these are ``(N,)``."""
-    x, y = np.floor(pixels).astype(np.int64).T
-    shown = (depth > 0) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
-    return x[shown], y[shown], shown
 
 
 def _occupied(smalls, evidence, axes: Frame, box, points, cells: int, growth: float) -> tuple[np.ndarray, float]:

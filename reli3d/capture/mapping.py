@@ -92,6 +92,15 @@ def _squared(vectors: np.ndarray) -> np.ndarray:
     return (vectors[:, 0] ** 2 + vectors[:, 1] ** 2)[:, None]
 
 
+def shown_pixels(
+    pixels: np.ndarray, depth: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Column and row of the pixels inside an image of ``shape``, and which of ``pixels (N, 2)`` these are ``(N,)``."""
+    x, y = np.floor(pixels).astype(np.int64).T
+    shown = (depth > 0) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+    return x[shown], y[shown], shown
+
+
 @dataclass(frozen=True)
 class Map:
     """Registered views, points with their mean reprojection errors, and matched features of pairs of views.
