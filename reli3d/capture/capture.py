@@ -76,6 +76,7 @@ class CaptureReport:
     images: int
     registered: int = 0
     lost: list[str] = field(default_factory=list)  # not registered
+    separate: int = 0  # of these, images that fit together, as of a second object
     left_out: dict[str, str] = field(default_factory=dict)  # registered, but of no use: name and reason
     views: list[str] = field(default_factory=list)
     reprojection_error: float = 0.0  # pixels, mean
@@ -159,6 +160,7 @@ def capture(
     report.registered = len(final.found.views)
     registered = {v.photo.name for v in final.found.views}
     report.lost = [p.name for p in photos if p.name not in registered]
+    report.separate = first.separate
     report.reprojection_error = round(final.found.mean_error, 3)
     report.plane = scene.plane is not None
     views = _whole_views(source, final, report)
@@ -545,7 +547,9 @@ def _check(report: CaptureReport) -> None:
     checks = (
         (
             registered >= LEAST_REGISTERED,
-            f"{100 * registered:.0f} % of the images registered, at least 80 % expected; {SMALL_STEPS}",
+            f"{100 * registered:.0f} % of the images registered, at least 80 % expected; "
+            + (f"{report.separate} others fit together, as of a second object or place; " if report.separate else "")
+            + SMALL_STEPS,
         ),
         (error < MOST_ERROR, f"reprojection error {error} px, below 1 expected"),
         (

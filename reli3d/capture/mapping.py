@@ -10,7 +10,7 @@ import signal
 import tempfile
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 
@@ -106,6 +106,7 @@ class Map:
     """Registered views, points with their mean reprojection errors, and matched features of pairs of views.
 
     matches: indices of two views and the pixels ``(M, 2)`` in each, as the descriptors match them: no geometry is used.
+    separate: number of other images that form a map of their own.
     """
 
     views: tuple[View, ...]
@@ -113,6 +114,7 @@ class Map:
     error: np.ndarray  # (P,) pixels
     tracks: np.ndarray  # (P,) number of views that observe the point
     matches: tuple[tuple[int, int, np.ndarray, np.ndarray], ...] = ()
+    separate: int = 0
 
     @property
     def mean_error(self) -> float:
@@ -233,6 +235,8 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
     if not models:
         return None
     largest = max(models.values(), key=lambda m: m.num_reg_images())
+    own = set(largest.reg_image_ids())
+    separate = max(len(set(m.reg_image_ids()) - own) for m in models.values())
     # Most matches lie on the support: the geometry that a pair has by itself is ambiguous and rejects matches on the
     # object.  That of the map's cameras is not, and judges each match by itself: a pair needs only one.
     options.min_num_matches = verification.min_num_inliers = 1
@@ -241,7 +245,7 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
     if masks is not None:  # few points: the added ones matter; without masks some may lie on what moves
         _adjust(largest, options.get_global_bundle_adjustment())
     with pycolmap.Database.open(database) as data:
-        return _read_model(largest, data, by_path, scales)
+        return replace(_read_model(largest, data, by_path, scales), separate=separate)
 
 
 def _adjust(model, options) -> None:

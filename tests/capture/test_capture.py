@@ -151,6 +151,17 @@ def test_cameras_of_an_object_that_is_moved_between_two_passes(tmp_path):
 
 
 @pytest.mark.slow
+def test_images_of_a_second_object_are_counted(ground_truth, tmp_path):
+    """Features have no mirror images: mirrored images are those of another object."""
+    folder = ground_truth.write(tmp_path / "photographs")
+    for k in range(12):
+        Image.fromarray(ground_truth.images[k, :, ::-1]).save(folder / f"mirrored{k}.png")
+    report = capture(folder, tmp_path / "object")
+    assert report.registered == len(ground_truth.images) and report.separate == 12
+    assert any("12 others fit together" in text for text in report.failed)
+
+
+@pytest.mark.slow
 def test_cameras_where_something_moves_behind_the_object(tmp_path):
     """A map of all features has positions wrong by 1.4 % of the distance, and no check fails."""
     passed = render_capture(views=24, passerby=True)
