@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import torch
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from reli3d.capture.consistency import completed_masks
 from reli3d.capture.mapping import Map, View, grown, shown_pixels
@@ -42,6 +43,7 @@ LEAST_SEEN = 0.5  # fraction of the views that must show a cell
 VOLUME_SIDE = 2.0, 1.15, 1.15  # sides of the volume over those of the object so far, in each pass
 PRIOR_INSIDE, PRIOR_OUTSIDE = 3.0, 6.0  # largest log odds by the distance in pixels from the volume's silhouette
 SHADOW_HEIGHT = 0.1, 0.4  # of the object's longest side and of its height: lower cells may be a shadow on the plane
+POINT_REACH = 0.04  # of the object's longest side: cells so near to one of its points are no shadow
 CERTAIN_OBJECT = 3.0  # log odds from which GrabCut keeps a pixel whose neighbors have them too: evidence is blurred
 CERTAIN_BACKGROUND = 2.0  # the same of the background: GrabCut would add shadows of a color like the object
 LIMIT_PIXELS = 12  # around the silhouette: farther out nothing is the object
@@ -90,7 +92,9 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
         if len(occupied) == 0:
             return masks
         box = np.stack([occupied.min(0), occupied.max(0)])
-        high = occupied[:, 2] > min(SHADOW_HEIGHT[0] * (box[1] - box[0]).max(), SHADOW_HEIGHT[1] * box[1, 2])
+        longest = (box[1] - box[0]).max()
+        high = occupied[:, 2] > min(SHADOW_HEIGHT[0] * longest, SHADOW_HEIGHT[1] * box[1, 2])
+        high |= cKDTree(points).query(occupied)[0] < POINT_REACH * longest
         occupied = axes.apply(occupied)
         cover = [_silhouette(s, occupied[high], cell) for s in smalls]
         odds = [_with_prior(s, e, occupied, cell) for s, e in zip(smalls, evidence, strict=True)]

@@ -92,6 +92,20 @@ def test_a_contact_shadow_in_masks_that_agree_becomes_texture_of_the_plane():
     assert not any((result[name] & (mask == 0)).any() for name, mask in masks.items())  # fused ones reach beyond
 
 
+def test_a_low_part_that_points_of_the_object_lie_on_is_no_shadow():
+    found, scene, pairs = gray_scene(shadow=0.0)
+    masks = {v.photo.name: (mask | low).astype(np.uint8) * 255 for v, mask, low in pairs}
+    u, v = np.mgrid[-SHADOW:SHADOW:5, -SHADOW:SHADOW:5].reshape(2, -1) / 100
+    disk = np.stack([u, v, np.full(u.shape, 0.02 - RADIUS)], -1)[np.hypot(u, v) < SHADOW / 100]
+    points = np.concatenate([found.points, disk])
+    count = len(points)
+    found = replace(found, points=points, error=np.zeros(count), tracks=np.full(count, 3))
+    scene = replace(scene, object=np.ones(count, bool), support=np.zeros(count, bool))
+    result = fused_masks(found, scene, masks)
+    left = [((result[v.photo.name] > 127) & low).sum() / low.sum() for v, _, low in pairs]
+    assert np.mean(left) > 0.9, left
+
+
 def test_masks_of_a_pixel_leave_no_colors_and_are_accepted():
     found, scene, pairs = gray_scene()
     masks = {v.photo.name: np.zeros(mask.shape, np.uint8) for v, mask, _ in pairs}
