@@ -132,9 +132,13 @@ def aligned(fixed: Views, others: Views) -> Frame:
 
     Minimizes, over rays just inside the silhouettes of either side, the distance by which they pass the visual hull of
     the other side (silhouette coherence, Hernandez, Schmitt and Cipolla 2007): a ray through the object meets every
-    hull.  It starts from the identity; an error of a few percent of the object's size is within its reach.
+    hull.  It starts from the identity; an error of a few percent of the object's size is within its reach.  Groups with
+    an empty hull stay where they are.
     """
-    low, high = visual_hull(fixed).box()
+    hulls = [visual_hull(v) for v in (fixed, others)]
+    if any(len(h.points) == 0 for h in hulls):
+        return Frame(1.0, np.eye(3), np.zeros(3))
+    low, high = hulls[0].box()
     middle, radius = (low + high) / 2, REACH * float((high - low).max())
     (hull, *rays), (other_hull, *other_rays) = (_hull_and_rays(v, middle, radius) for v in (fixed, others))
     motion = torch.zeros(7, requires_grad=True)  # rotation vector, shift, logarithm of the scale

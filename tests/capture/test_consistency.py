@@ -71,6 +71,13 @@ def test_a_turn_that_no_silhouette_shows_stays_as_it_is():
     np.testing.assert_allclose(found.apply(middle + shift), middle, atol=0.004)
 
 
+def test_groups_whose_masks_have_no_common_point_stay_where_they_are():
+    fixed, others, masks = pair_of_groups()
+    masks |= silhouettes(others[::2], ((-0.25, -0.3, 0.45, 0.05),))
+    found = aligned(_as_views(fixed, masks), _as_views(others, masks))
+    assert found.scale == 1.0 and np.array_equal(found.turn, np.eye(3)) and not found.shift.any()
+
+
 def test_parts_that_a_few_masks_lack_are_added_and_nothing_else():
     views = ring(16)
     truth, without = silhouettes(views), silhouettes(views, SPHERES[:2] + SPHERES[3:])
