@@ -21,6 +21,7 @@ from reli3d.capture.mapping import Map, View, map_photos, shown_pixels
 from reli3d.capture.masks import grabcut_mask, is_empty, key_mask, moving_region, touches_border
 from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
 from reli3d.capture.rigidity import (
+    SMALLEST_GROUP,
     Frame,
     Group,
     completed_groups,
@@ -76,7 +77,7 @@ class CaptureReport:
     images: int
     registered: int = 0
     lost: list[str] = field(default_factory=list)  # not registered
-    separate: int = 0  # of these, images that fit together, as of a second object
+    separate: int = 0  # of these, images that form a second map, as of another object or after a gap
     left_out: dict[str, str] = field(default_factory=dict)  # registered, but of no use: name and reason
     views: list[str] = field(default_factory=list)
     reprojection_error: float = 0.0  # pixels, mean
@@ -321,8 +322,8 @@ def _refined(
     Where matches inside the masks do not fit the cameras, or the masks disagree, their features are mapped alone.  If
     the two maps differ by more than a similarity, and these features fit the second one better, the object was moved.
     The first map, if matches outside the masks fit it, still has the better lenses, and the better cameras within each
-    group of views between which the object did not move.  The masks are fused, those of a moved object by groups, whose
-    motions they correct; masks that agree can only lose contact shadows.
+    group of views between which the object did not move.  The masks are fused, per group for a moved object, and then
+    align the groups.  Masks that agree can only lose contact shadows.
     """
     first = segmented.found
     down = np.stack([v.rotation[1] for v in first.views]).mean(0)
@@ -378,12 +379,12 @@ def _refined(
             at = replace(first, views=tuple(by_name[name] for name in group.names), points=points)
             whole = replace(scene, object=np.ones(len(points), bool))
             masks |= fused_masks(at, whole, {name: masks[name] for name in group.names if name in masks})
-    second = _posed(second, _aligned(groups, by_name, masks), by_name)
-    refined = _Segmented(second, masks)
+        masks = {name: mask for name, mask in masks.items() if not is_empty(mask)}
     if len(masks) < KEPT_FRACTION * len(segmented.masks) or (
-        known is None and _agreement(refined.views, masks) < _agreement(again, segmented.masks)
+        known is None and _agreement(_Segmented(second, masks).views, masks) < _agreement(again, segmented.masks)
     ):
-        refined = _Segmented(second, {v.photo.name: segmented.masks[v.photo.name] for v in again})
+        masks = {v.photo.name: segmented.masks[v.photo.name] for v in again}
+    refined = _Segmented(_posed(second, _aligned_groups(groups, by_name, masks), by_name), masks)
     if groups and scene.plane:
         up = groups[0].turn @ up
         return refined, up, float(groups[0].apply(scene.plane.foot(scene.center)) @ up)
@@ -402,18 +403,25 @@ def _posed(found: Map, groups: Sequence[Group], views: dict[str, View]) -> Map:
     return replace(found, views=tuple(replace(v, rotation=p.rotation, translation=p.translation) for v, p in pairs))
 
 
-def _aligned(groups: Sequence[Group], views: dict[str, View], masks: dict[str, np.ndarray]) -> list[Group]:
-    """The groups with motions that are corrected, one after the other, by the silhouettes in the groups before."""
+def _aligned_groups(groups: Sequence[Group], views: dict[str, View], masks: dict[str, np.ndarray]) -> list[Group]:
+    """The groups with motions corrected, one after the other, by the silhouettes of the groups before.
+
+    A correction that makes the visual hull of all these views fill less of the masks is left out.
+    """
     whole = {name for name, mask in masks.items() if not touches_border(mask)}
-    corrected: list[Group] = []
+    before: list[View] = []
+    corrected = []
     for group in groups:
-        own, before = (
-            [g.moved(views[name]) for g in some for name in g.names if name in whole] for some in ([group], corrected)
-        )
-        if own and before:
+        names = [name for name in group.names if name in whole]
+        own = [group.moved(views[name]) for name in names]
+        if min(len(own), len(before)) >= SMALLEST_GROUP:
             motion = aligned(_as_views(before, masks), _as_views(own, masks))
             shift = motion.apply(group.shift)
-            group = replace(group, scale=motion.scale * group.scale, turn=motion.turn @ group.turn, shift=shift)
+            better = replace(group, scale=motion.scale * group.scale, turn=motion.turn @ group.turn, shift=shift)
+            moved = [better.moved(views[name]) for name in names]
+            if _agreement(before + moved, masks) >= _agreement(before + own, masks):
+                group, own = better, moved
+        before += own
         corrected.append(group)
     return corrected
 
@@ -548,7 +556,7 @@ def _check(report: CaptureReport) -> None:
         (
             registered >= LEAST_REGISTERED,
             f"{100 * registered:.0f} % of the images registered, at least 80 % expected; "
-            + (f"{report.separate} others fit together, as of a second object or place; " if report.separate else "")
+            + (f"{report.separate} others fit together (a second object, or a gap); " if report.separate else "")
             + SMALL_STEPS,
         ),
         (error < MOST_ERROR, f"reprojection error {error} px, below 1 expected"),

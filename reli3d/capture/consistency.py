@@ -1,4 +1,4 @@
-"""Consistency of silhouettes: groups of views aligned by it, and parts of the object that only some masks show."""
+"""Silhouette consistency: aligns groups of views, and completes masks that lack parts of the object."""
 
 from __future__ import annotations
 
@@ -22,50 +22,58 @@ MARGIN = 0.1  # of the longest side, around the box of the object
 SLAB = 8  # layers of cells at a time
 MOST_OUTSIDE = 0.3  # fraction of the views in which a cell may lie outside the mask
 OUTSIDE_WEIGHT = 0.5  # of a covered pixel outside a mask over an uncovered pixel inside
-OVERLAP = 0.7  # cells by which the silhouettes of cells reach over an outline
-EDGE = 2.0  # cells: pixels nearer to the outline have smaller weights
-STEPS, STEP_SIZE, START = 60, 0.2, -1.5  # of Adam on logits
-GRID, REACH = 96, 0.75  # cells along the volume of a hull; half its side over the longest side of the object
-OUTLINE = -0.5, 1.0  # pixels inside the mask from which rays are taken
-RAYS, SAMPLES = 2500, 48  # of each side; along a ray
-ALIGN_STEPS, ALIGN_SIZE = 60, 0.004  # of Adam, whose step decreases to 0; of radians, logarithms and REACH
-GREATEST = 0.004  # of REACH: residuals beyond count linearly
-STIFFNESS = 0.0005  # of motions that no silhouette shows, such as turns about an axis of symmetry
+OVERLAP_CELLS = 0.7  # cells by which the silhouettes of cells reach over an outline
+EDGE_CELLS = 2.0  # cells: pixels nearer to the outline have smaller weights
+STEPS, STEP_SIZE, START_LOGIT = 60, 0.2, -1.5  # of Adam on logits
+GRID, HULL_HALF_SIDE = 96, 0.75  # cells along the volume of a hull; half its side over the longest side of the object
+OUTLINE_PIXELS = -0.5, 1.0  # signed distance of the pixels from which rays are taken, positive inside
+RAYS, RAY_SAMPLES = 2500, 48  # of each side; along a ray
+ALIGN_STEPS, ALIGN_STEP_SIZE = (
+    60,
+    0.004,
+)  # of Adam, whose step decreases to 0; of radians, logarithms and HULL_HALF_SIDE
+HUBER_DELTA = 0.004  # of HULL_HALF_SIDE: residuals beyond count linearly
+MOTION_PENALTY = 0.0005  # of motions that no silhouette shows, such as turns about an axis of symmetry
 
 
 def completed_masks(views: Sequence[View], masks: dict[str, np.ndarray], box: np.ndarray) -> dict[str, np.ndarray]:
     """Masks by name, united with the silhouettes of the volume that explains all masks with the fewest wrong pixels.
 
     A visual hull lacks each part that a single mask lacks.  The volume is the hull and further cells: these minimize
-    the number of pixels inside masks that no occupied cell projects to, plus OUTSIDE_WEIGHT times that of pixels
-    outside that one does.  Occupancies are probabilities, and a pixel is covered unless all of its cells are empty.
+    the number of pixels inside masks that no occupied cell projects to, plus OUTSIDE_WEIGHT times the number of pixels
+    outside the masks that an occupied cell projects to.  Occupancies are probabilities, and a pixel is covered unless
+    all of its cells are empty.
     box: lower and upper corner ``(2, 3)`` of the object.
     """
     cell = float((box[1] - box[0]).max()) / CELLS
+    views = [v for v in views if (masks[v.photo.name] > 127).any()]
+    if cell == 0 or not views:
+        return masks
     inside = [masks[v.photo.name] > 127 for v in views]
     points, outside = _cells(views, inside, box, cell)
     hull, more = points[outside == 0], points[outside > 0]
     if len(hull) == 0 or len(more) == 0:
         return masks
-    sizes, pixels, wanted, weight = [], [], [], []
+    sizes, pixels, target, weight = [], [], [], []
     count = 0
     for view, mask in zip(views, inside, strict=True):
-        footprint = view.focal * cell / float(np.median(view.project(hull)[1]))  # pixels
+        footprint = max(1.0, view.focal * cell / float(np.median(view.project(points)[1])))  # pixels
         size = max(1, round(mask.shape[1] / footprint)), max(1, round(mask.shape[0] / footprint))
         small = (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5).astype(np.uint8)
         away = cv2.distanceTransform(small, cv2.DIST_L2, 5) + cv2.distanceTransform(1 - small, cv2.DIST_L2, 5)
-        cost = np.minimum(away / EDGE, 1) * np.where(small, 1.0, OUTSIDE_WEIGHT) * (_shown(view, hull, size) == 0)
+        cost = np.minimum(away / EDGE_CELLS, 1) * np.where(small, 1.0, OUTSIDE_WEIGHT) * (_shown(view, hull, size) == 0)
         sizes.append(size)
-        pixels.append(count + _indices(view, more, size))
-        wanted.append(np.append(small > 0, False))
-        weight.append(np.append(cost, 0.0))
-        count += small.size + 1
-    added = more[_explaining(np.stack(pixels), np.concatenate(wanted), np.concatenate(weight))]
+        covered, index = np.unique(_indices(view, more, size), return_inverse=True)  # no other pixel depends on them
+        pixels.append(count + index)
+        target.append(np.append(small > 0, False)[covered])
+        weight.append(np.append(cost, 0.0)[covered].astype(np.float32))
+        count += len(covered)
+    added = more[_explaining(np.stack(pixels), np.concatenate(target), np.concatenate(weight))]
     completed = dict(masks)
     for view, size in zip(views, sizes, strict=True):
         mask = masks[view.photo.name]
         union = np.maximum(mask, full_size(_shown(view, added, size), mask.shape))
-        overlap = max(1, int(OVERLAP * mask.shape[1] / size[0]))
+        overlap = max(1, int(OVERLAP_CELLS * mask.shape[1] / size[0]))
         union = cv2.erode(union, np.ones((2 * overlap + 1, 2 * overlap + 1), np.uint8))
         completed[view.photo.name] = np.maximum(mask, union)
     return completed
@@ -109,40 +117,43 @@ def _shown(view: View, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.morphologyEx(silhouette[:-1].reshape(size[::-1]), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
 
 
-def _explaining(pixels: np.ndarray, wanted: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Which cells ``(N,)`` are occupied.  pixels: those of each cell ``(V, N)``.  wanted, weight: of each pixel."""
-    uncovered = wanted & (weight > 0)
+@torch.inference_mode(False)
+@torch.enable_grad()
+def _explaining(pixels: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Which cells ``(N,)`` are occupied.  pixels: those of each cell ``(V, N)``.  target, weight: of each pixel."""
+    uncovered = target & (weight > 0)
     useful = uncovered[pixels].any(0)
     at = torch.from_numpy(pixels[:, useful].ravel())
-    target, cost = torch.from_numpy(wanted), torch.from_numpy(weight.astype(np.float32))
-    logits = torch.full((int(useful.sum()),), START, requires_grad=True)
+    inside, cost = torch.from_numpy(target), torch.from_numpy(weight)
+    logits = torch.full((int(useful.sum()),), START_LOGIT, dtype=torch.float32, requires_grad=True)
     optimizer = torch.optim.Adam([logits], STEP_SIZE)
     for _ in range(STEPS):
         empty = -softplus(logits).expand(len(pixels), -1).reshape(-1)  # log of the probability
-        empty = torch.zeros(len(target)).index_add(0, at, empty).exp()
-        loss = (cost * torch.where(target, empty, 1 - empty)).sum()
+        empty = torch.zeros_like(cost).index_add(0, at, empty).exp()
+        loss = (cost * torch.where(inside, empty, 1 - empty)).sum()
         (logits.grad,) = torch.autograd.grad(loss, logits)
         optimizer.step()
     useful[useful] = (logits.detach() > 0).numpy()
     return useful
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def aligned(fixed: Views, others: Views) -> Frame:
     """The similarity that moves the cameras of ``others`` to where their silhouettes agree with those of ``fixed``.
 
     Minimizes, over rays just inside the silhouettes of either side, the distance by which they pass the visual hull of
     the other side (silhouette coherence, Hernandez, Schmitt and Cipolla 2007): a ray through the object meets every
-    hull.  It starts from the identity; an error of a few percent of the object's size is within its reach.  Groups with
-    an empty hull stay where they are.
+    hull.  Converges from errors of a few percent of the object's size.  The identity where either hull is empty.
     """
     hulls = [visual_hull(v) for v in (fixed, others)]
     if any(len(h.points) == 0 for h in hulls):
         return Frame(1.0, np.eye(3), np.zeros(3))
     low, high = hulls[0].box()
-    middle, radius = (low + high) / 2, REACH * float((high - low).max())
+    middle, radius = (low + high) / 2, HULL_HALF_SIDE * max(float((high - low).max()), hulls[0].cell)
     (hull, *rays), (other_hull, *other_rays) = (_hull_and_rays(v, middle, radius) for v in (fixed, others))
-    motion = torch.zeros(7, requires_grad=True)  # rotation vector, shift, logarithm of the scale
-    optimizer = torch.optim.Adam([motion], ALIGN_SIZE)
+    motion = torch.zeros(7, dtype=torch.float32, requires_grad=True)  # rotation vector, shift, logarithm of the scale
+    optimizer = torch.optim.Adam([motion], ALIGN_STEP_SIZE)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.01, ALIGN_STEPS)
     for _ in range(ALIGN_STEPS):
         turn, shift, scale = _moved(motion)
@@ -151,7 +162,7 @@ def aligned(fixed: Views, others: Views) -> Frame:
         origins, directions = rays
         back = scale * _distance(other_hull, (origins - shift) @ turn / scale, directions @ turn)
         passed = torch.cat([passed, back])
-        loss = huber_loss(passed, torch.zeros_like(passed), delta=GREATEST) + STIFFNESS * motion.square().sum()
+        loss = huber_loss(passed, torch.zeros_like(passed), delta=HUBER_DELTA) + MOTION_PENALTY * motion.square().sum()
         (motion.grad,) = torch.autograd.grad(loss, motion)
         optimizer.step()
         schedule.step()
@@ -179,20 +190,20 @@ def _hull_and_rays(
     c2w[:, :3, 3] = (c2w[:, :3, 3] - middle.float()) / radius
     camera = Camera(c2w, views.intrinsics, width, height)
     distance = mask_distance(masks)
-    at = ((distance > OUTLINE[0]) & (distance < OUTLINE[1])).nonzero()
+    at = ((distance > OUTLINE_PIXELS[0]) & (distance < OUTLINE_PIXELS[1])).nonzero()
     at = at[:: max(1, len(at) // RAYS)]
     view, y, x = at.unbind(-1)
     fx, fy, cx, cy = views.intrinsics[view].unbind(-1)
     local = torch.stack([(x + 0.5 - cx) / fx, -(y + 0.5 - cy) / fy, -torch.ones_like(fx)], -1)
     directions = normalize((c2w[view, :3, :3] @ local[..., None])[..., 0], dim=-1)
-    hull = hull_grid(torch.linspace(-1.0, 1.0, GRID), distance, camera)
+    hull = hull_grid(torch.linspace(-1.0, 1.0, GRID, dtype=torch.float32), distance, camera)
     return hull, c2w[view, :3, 3], directions
 
 
 def _distance(hull: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
     """Distance ``(R,)`` by which rays pass the hull, 0 where they meet it."""
     nearest = -(origins * directions).sum(-1, keepdim=True)
-    along = nearest + torch.linspace(-1.0, 1.0, SAMPLES)
+    along = nearest + torch.linspace(-1.0, 1.0, RAY_SAMPLES, dtype=torch.float32)
     points = origins[:, None] + along[..., None] * directions[:, None]
     inside = grid_sample(hull[None, None], points.flip(-1)[None, None], align_corners=True, padding_mode="border")
     return (-inside[0, 0, 0].amax(-1)).clamp_min(0.0)

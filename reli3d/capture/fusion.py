@@ -19,7 +19,7 @@ from reli3d.capture.consistency import completed_masks
 from reli3d.capture.mapping import Map, View, grown, shown_pixels
 from reli3d.capture.masks import COARSE_SIDE, full_size, grabcut, reduced, refined
 from reli3d.capture.rigidity import Frame
-from reli3d.capture.scene import Scene
+from reli3d.capture.scene import PLANE_TOLERANCE, Scene
 
 SIDES = COARSE_SIDE, COARSE_SIDE, 720  # pixels along the longer side of the images; memory limits the last
 TEXEL = 1.5  # pixels of the images, at the cameras' median distance
@@ -68,9 +68,9 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     The log odds of a pixel, object over background, compare a mixture of Gaussians of the object's colors with the
     plane's texture, or elsewhere with the colors around the object.  They give the log odds that a cell of a volume is
     occupied (Franco and Boyer 2005), on which all views have to agree.  From the second pass on, cells below
-    SHADOW_HEIGHT do not hide the plane, so that a contact shadow becomes a part of its texture.  Each pass ends with
-    GrabCut from the log odds of the pixels and the volume's silhouettes; the last has larger images.  At the end,
-    :func:`completed_masks`.
+    SHADOW_HEIGHT and farther than POINT_REACH from the object's points do not hide the plane, so that a contact shadow
+    becomes a part of its texture.  Each pass ends with GrabCut from the log odds of the pixels and the volume's
+    silhouettes; the last has larger images.  :func:`completed_masks` adds parts that some masks lack.
     """
     if scene.plane is None:
         return masks
@@ -79,6 +79,7 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     inside = [masks[v.photo.name] for v in views]
     points = axes.inverse(found.points[scene.object])
     box = np.stack([np.minimum(points.min(0), [np.inf, np.inf, 0]), points.max(0)])
+    sure = cKDTree(points[points[:, 2] > 1.5 * PLANE_TOLERANCE * scene.distance])  # others may lie on a shadow
     cover = inside
     for side, cells, growth in zip(SIDES, GRIDS, VOLUME_SIDE, strict=True):
         smalls = [_Small(v, *reduced(v.photo.pixels, side)) for v in views]
@@ -94,7 +95,7 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
         box = np.stack([occupied.min(0), occupied.max(0)])
         longest = (box[1] - box[0]).max()
         high = occupied[:, 2] > min(SHADOW_HEIGHT[0] * longest, SHADOW_HEIGHT[1] * box[1, 2])
-        high |= cKDTree(points).query(occupied)[0] < POINT_REACH * longest
+        high |= sure.query(occupied)[0] < POINT_REACH * longest
         occupied = axes.apply(occupied)
         cover = [_silhouette(s, occupied[high], cell) for s in smalls]
         odds = [_with_prior(s, e, occupied, cell) for s, e in zip(smalls, evidence, strict=True)]

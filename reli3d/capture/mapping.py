@@ -236,7 +236,7 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
         return None
     largest = max(models.values(), key=lambda m: m.num_reg_images())
     own = set(largest.reg_image_ids())
-    separate = max(len(set(m.reg_image_ids()) - own) for m in models.values())
+    separate = max((len(m.reg_image_ids()) for m in models.values() if own.isdisjoint(m.reg_image_ids())), default=0)
     # Most matches lie on the support: the geometry that a pair has by itself is ambiguous and rejects matches on the
     # object.  That of the map's cameras is not, and judges each match by itself: a pair needs only one.
     options.min_num_matches = verification.min_num_inliers = 1

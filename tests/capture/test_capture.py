@@ -152,7 +152,7 @@ def test_cameras_of_an_object_that_is_moved_between_two_passes(tmp_path):
 
 @pytest.mark.slow
 def test_images_of_a_second_object_are_counted(ground_truth, tmp_path):
-    """Features have no mirror images: mirrored images are those of another object."""
+    """SIFT is not mirror-invariant: mirrored images match only each other, like those of a second object."""
     folder = ground_truth.write(tmp_path / "photographs")
     for k in range(12):
         Image.fromarray(ground_truth.images[k, :, ::-1]).save(folder / f"mirrored{k}.png")

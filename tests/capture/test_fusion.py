@@ -96,7 +96,7 @@ def test_a_low_part_that_points_of_the_object_lie_on_is_no_shadow():
     found, scene, pairs = gray_scene(shadow=0.0)
     masks = {v.photo.name: (mask | low).astype(np.uint8) * 255 for v, mask, low in pairs}
     u, v = np.mgrid[-SHADOW:SHADOW:5, -SHADOW:SHADOW:5].reshape(2, -1) / 100
-    disk = np.stack([u, v, np.full(u.shape, 0.02 - RADIUS)], -1)[np.hypot(u, v) < SHADOW / 100]
+    disk = np.stack([u, v, np.full(u.shape, 0.03 - RADIUS)], -1)[np.hypot(u, v) < SHADOW / 100]
     points = np.concatenate([found.points, disk])
     count = len(points)
     found = replace(found, points=points, error=np.zeros(count), tracks=np.full(count, 3))
