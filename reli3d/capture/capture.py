@@ -319,11 +319,11 @@ def _refined(
     """The map in whose frame the object does not move, with its masks; in it the upward direction ``(3,)`` and the
     ground's height along it (None: unknown).
 
-    Where matches inside the masks do not fit the cameras, or the masks disagree, their features are mapped alone.  If
+    Where matches inside the masks do not fit the cameras, or masks disagree, their features are mapped alone.  If
     the two maps differ by more than a similarity, and these features fit the second one better, the object was moved.
     The first map, if matches outside the masks fit it, still has the better lenses, and the better cameras within each
     group of views between which the object did not move.  The masks are fused, per group for a moved object, and then
-    align the groups.  Masks that agree can only lose contact shadows.
+    align the groups.  Masks that agree only lose contact shadows.
     """
     first = segmented.found
     down = np.stack([v.rotation[1] for v in first.views]).mean(0)

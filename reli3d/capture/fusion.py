@@ -63,14 +63,14 @@ class _Small:
 
 
 def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Masks by name of the views in ``masks``, which may lack parts of the object; unchanged without a support plane.
+    """Masks by name of the views in ``masks``, segmented jointly; unchanged without a support plane.
 
     The log odds of a pixel, object over background, compare a mixture of Gaussians of the object's colors with the
-    plane's texture, or elsewhere with the colors around the object.  They give the log odds that a cell of a volume is
-    occupied (Franco and Boyer 2005), on which all views have to agree.  From the second pass on, cells below
-    SHADOW_HEIGHT and farther than POINT_REACH from the object's points do not hide the plane, so that a contact shadow
-    becomes a part of its texture.  Each pass ends with GrabCut from the log odds of the pixels and the volume's
-    silhouettes; the last has larger images.  :func:`completed_masks` adds parts that some masks lack.
+    plane's texture, or elsewhere with the colors around the object.  Those of all views give the log odds that a cell
+    of a volume is occupied (Franco and Boyer 2005).  From the second pass on, cells below
+    SHADOW_HEIGHT without points of the object near them do not hide the plane: a contact shadow becomes a part of its
+    texture.  Each pass ends with GrabCut from the log odds of pixels and silhouettes; the last has larger images.
+    :func:`completed_masks` adds parts that some masks lack.
     """
     if scene.plane is None:
         return masks
