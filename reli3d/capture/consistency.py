@@ -28,10 +28,7 @@ STEPS, STEP_SIZE, START_LOGIT = 60, 0.2, -1.5  # of Adam on logits
 GRID, HULL_HALF_SIDE = 96, 0.75  # cells along the volume of a hull; half its side over the longest side of the object
 OUTLINE_PIXELS = -0.5, 1.0  # signed distance of the pixels from which rays are taken, positive inside
 RAYS, RAY_SAMPLES = 2500, 48  # of each side; along a ray
-ALIGN_STEPS, ALIGN_STEP_SIZE = (
-    60,
-    0.004,
-)  # of Adam, whose step decreases to 0; of radians, logarithms and HULL_HALF_SIDE
+ALIGN_STEPS, ALIGN_STEP_SIZE = 60, 0.004  # of Adam; at first, in radians, of HULL_HALF_SIDE and of a logarithm
 HUBER_DELTA = 0.004  # of HULL_HALF_SIDE: residuals beyond count linearly
 MOTION_PENALTY = 0.0005  # of motions that no silhouette shows, such as turns about an axis of symmetry
 
@@ -42,8 +39,7 @@ def completed_masks(views: Sequence[View], masks: dict[str, np.ndarray], box: np
     A visual hull lacks each part that a single mask lacks.  The volume is the hull and further cells: these minimize
     the number of pixels inside masks that no occupied cell projects to, plus OUTSIDE_WEIGHT times the number of pixels
     outside the masks that an occupied cell projects to.  Occupancies are probabilities, and a pixel is covered unless
-    all of its cells are empty.
-    box: lower and upper corner ``(2, 3)`` of the object.
+    all of its cells are empty.  box: lower and upper corner ``(2, 3)`` of the object.
     """
     cell = float((box[1] - box[0]).max()) / CELLS
     views = [v for v in views if (masks[v.photo.name] > 127).any()]
@@ -63,11 +59,11 @@ def completed_masks(views: Sequence[View], masks: dict[str, np.ndarray], box: np
         away = cv2.distanceTransform(small, cv2.DIST_L2, 5) + cv2.distanceTransform(1 - small, cv2.DIST_L2, 5)
         cost = np.minimum(away / EDGE_CELLS, 1) * np.where(small, 1.0, OUTSIDE_WEIGHT) * (_shown(view, hull, size) == 0)
         sizes.append(size)
-        covered, index = np.unique(_indices(view, more, size), return_inverse=True)  # no other pixel depends on them
+        reached, index = np.unique(_indices(view, more, size), return_inverse=True)  # the others do not change
         pixels.append(count + index)
-        target.append(np.append(small > 0, False)[covered])
-        weight.append(np.append(cost, 0.0)[covered].astype(np.float32))
-        count += len(covered)
+        target.append(np.append(small > 0, False)[reached])
+        weight.append(np.append(cost, 0.0)[reached].astype(np.float32))
+        count += len(reached)
     added = more[_explaining(np.stack(pixels), np.concatenate(target), np.concatenate(weight))]
     completed = dict(masks)
     for view, size in zip(views, sizes, strict=True):
@@ -142,8 +138,8 @@ def _explaining(pixels: np.ndarray, target: np.ndarray, weight: np.ndarray) -> n
 def aligned(fixed: Views, others: Views) -> Frame:
     """The similarity that moves the cameras of ``others`` to where their silhouettes agree with those of ``fixed``.
 
-    Minimizes, over rays just inside the silhouettes of either side, the distance by which they pass the visual hull of
-    the other side (silhouette coherence, Hernandez, Schmitt and Cipolla 2007): a ray through the object meets every
+    Minimizes, over rays along the outlines of either side, the distance by which they miss the visual hull of the
+    other side (silhouette coherence, Hernandez, Schmitt and Cipolla 2007): a ray through the object meets every
     hull.  Converges from errors of a few percent of the object's size.  The identity where either hull is empty.
     """
     hulls = [visual_hull(v) for v in (fixed, others)]
@@ -158,11 +154,11 @@ def aligned(fixed: Views, others: Views) -> Frame:
     for _ in range(ALIGN_STEPS):
         turn, shift, scale = _moved(motion)
         origins, directions = other_rays
-        passed = _distance(hull, scale * origins @ turn.T + shift, directions @ turn.T)
+        missed = _distance(hull, scale * origins @ turn.T + shift, directions @ turn.T)
         origins, directions = rays
         back = scale * _distance(other_hull, (origins - shift) @ turn / scale, directions @ turn)
-        passed = torch.cat([passed, back])
-        loss = huber_loss(passed, torch.zeros_like(passed), delta=HUBER_DELTA) + MOTION_PENALTY * motion.square().sum()
+        missed = torch.cat([missed, back])
+        loss = huber_loss(missed, torch.zeros_like(missed), delta=HUBER_DELTA) + MOTION_PENALTY * motion.square().sum()
         (motion.grad,) = torch.autograd.grad(loss, motion)
         optimizer.step()
         schedule.step()
@@ -173,6 +169,7 @@ def aligned(fixed: Views, others: Views) -> Frame:
 
 
 def _moved(motion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Rotation ``(3, 3)``, shift ``(3,)`` and scale."""
     x, y, z = motion[:3]
     o = torch.zeros_like(x)
     return torch.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o]).view(3, 3)), motion[3:6], motion[6].exp()
@@ -181,8 +178,8 @@ def _moved(motion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tens
 def _hull_and_rays(
     views: Views, middle: torch.Tensor, radius: float
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Signed distance of the hull of ``views`` on a grid, and origins and directions ``(R, 3)`` of rays just inside
-    their silhouettes, in units of ``radius`` about ``middle``.
+    """Signed distance of the hull of ``views`` on a grid, and origins and directions ``(R, 3)`` of rays along their
+    outlines, in units of ``radius`` about ``middle``.
     """
     height, width = (max(m.shape[k] for m in views.masks) for k in (0, 1))
     masks = torch.stack([pad(m, (0, width - m.shape[1], 0, height - m.shape[0])) for m in views.masks])
@@ -201,7 +198,7 @@ def _hull_and_rays(
 
 
 def _distance(hull: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-    """Distance ``(R,)`` by which rays pass the hull, 0 where they meet it."""
+    """Distance ``(R,)`` by which rays miss the hull, 0 where they meet it."""
     nearest = -(origins * directions).sum(-1, keepdim=True)
     along = nearest + torch.linspace(-1.0, 1.0, RAY_SAMPLES, dtype=torch.float32)
     points = origins[:, None] + along[..., None] * directions[:, None]

@@ -67,9 +67,9 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
 
     The log odds of a pixel, object over background, compare a mixture of Gaussians of the object's colors with the
     plane's texture, or elsewhere with the colors around the object.  Those of all views give the log odds that a cell
-    of a volume is occupied (Franco and Boyer 2005).  From the second pass on, cells below
-    SHADOW_HEIGHT without points of the object near them do not hide the plane: a contact shadow becomes a part of its
-    texture.  Each pass ends with GrabCut from the log odds of pixels and silhouettes; the last has larger images.
+    of a volume is occupied (Franco and Boyer 2005).  From the second pass on, cells below SHADOW_HEIGHT
+    without points of the object near them do not hide the plane: a contact shadow becomes a part of its texture.  Each
+    pass ends with GrabCut from the log odds of pixels and silhouettes; the last has larger images.
     :func:`completed_masks` adds parts that some masks lack.
     """
     if scene.plane is None:
