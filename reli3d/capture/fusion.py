@@ -46,6 +46,7 @@ SHADOW_HEIGHT = 0.1, 0.4  # of the object's longest side and of its height: lowe
 POINT_REACH = 0.04  # of the object's longest side: cells so near to one of its points are no shadow
 CERTAIN_OBJECT = 3.0  # log odds from which GrabCut keeps a pixel whose neighbors have them too: evidence is blurred
 CERTAIN_BACKGROUND = 2.0  # the same of the background: GrabCut would add shadows of a color like the object
+CERTAIN_PLANE = 3.0  # the same before the prior, which only the plane's texture reaches
 LIMIT_PIXELS = 12  # around the silhouette: farther out nothing is the object
 
 
@@ -99,7 +100,7 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
         occupied = axes.apply(occupied)
         cover = [_silhouette(s, occupied[high], cell) for s in smalls]
         odds = [_with_prior(s, e, occupied, cell) for s, e in zip(smalls, evidence, strict=True)]
-        inside = [_segmented(s.image, o) for s, o in zip(smalls, odds, strict=True)]
+        inside = [_segmented(s.image, o, e) for s, o, e in zip(smalls, odds, evidence, strict=True)]
     photos = [v.photo for v in views]
     fused = {p.name: full_size(refined(p.pixels, m), p.pixels.shape) for p, m in zip(photos, inside, strict=True)}
     return completed_masks(views, fused, np.stack([occupied.min(0), occupied.max(0)]))
@@ -327,11 +328,12 @@ def _with_prior(small: _Small, evidence: np.ndarray, occupied: np.ndarray, cell:
     return np.where(away > -LIMIT_PIXELS, evidence + np.clip(away, -PRIOR_OUTSIDE, PRIOR_INSIDE), -np.inf)
 
 
-def _segmented(image: np.ndarray, odds: np.ndarray) -> np.ndarray:
-    """Mask ``(H, W)`` uint8 by GrabCut, which starts from the log odds of the pixels."""
+def _segmented(image: np.ndarray, odds: np.ndarray, evidence: np.ndarray) -> np.ndarray:
+    """Mask ``(H, W)`` uint8 by GrabCut, which starts from the log odds of the pixels; ``evidence``: without prior."""
     limit = odds > -np.inf
     labels = np.where(odds > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    for certain, label in ((odds > CERTAIN_OBJECT, cv2.GC_FGD), (odds < -CERTAIN_BACKGROUND, cv2.GC_BGD)):
+    background = (odds < -CERTAIN_BACKGROUND) | (evidence < -CERTAIN_PLANE)
+    for certain, label in ((odds > CERTAIN_OBJECT, cv2.GC_FGD), (background, cv2.GC_BGD)):
         labels[cv2.erode(certain.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0] = label
     labels[~limit] = cv2.GC_BGD
     return grabcut(image, labels, limit)
