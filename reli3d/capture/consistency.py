@@ -10,13 +10,15 @@ import torch
 from torch.nn.functional import grid_sample, huber_loss, normalize, pad, softplus
 
 from reli3d.capture.mapping import View, shown_pixels
-from reli3d.capture.masks import full_size
+from reli3d.capture.masks import full_size, touches_border
 from reli3d.capture.rigidity import Frame
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import hull_grid, mask_distance
+from reli3d.views.check import agreement
 from reli3d.views.normalize import visual_hull
 from reli3d.views.views import Views
 
+MASK_SIDE = 512  # pixels of the masks by which a visual hull is judged
 CELLS = 160  # along the longest side of the object
 MARGIN = 0.1  # of the longest side, around the box of the object
 SLAB = 8  # layers of cells at a time
@@ -31,6 +33,30 @@ RAYS, RAY_SAMPLES = 2500, 48  # of each side; along a ray
 ALIGN_STEPS, ALIGN_STEP_SIZE = 60, 0.004  # of Adam; at first, in radians, of HULL_HALF_SIDE and of a logarithm
 HUBER_DELTA = 0.004  # of HULL_HALF_SIDE: residuals beyond count linearly
 MOTION_PENALTY = 0.0005  # of motions that no silhouette shows, such as turns about an axis of symmetry
+
+
+def masked_views(views: Sequence[View], masks: dict[str, np.ndarray]) -> Views:
+    """Small undistorted masks and their cameras; the images are black."""
+    small, cameras = [], []
+    for view in views:
+        w, h = view.photo.size
+        scale = min(1.0, MASK_SIDE / max(w, h))
+        mask = cv2.resize(masks[view.photo.name], (round(w * scale), round(h * scale)), interpolation=cv2.INTER_AREA)
+        small.append(torch.from_numpy(view.undistorted(mask).astype(np.float32) / 255).clamp(0, 1))
+        cameras.append([view.focal * scale, view.focal * scale, *(view.principal * scale)])
+    return Views(
+        images=tuple(torch.zeros(1, dtype=torch.float32).expand(*m.shape, 3) for m in small),
+        masks=tuple(small),
+        c2w=torch.from_numpy(np.stack([v.c2w for v in views]).astype(np.float32)),
+        intrinsics=torch.tensor(cameras, dtype=torch.float32),
+        names=tuple(v.photo.name for v in views),
+    )
+
+
+def hull_agreement(views: Sequence[View], masks: dict[str, np.ndarray]) -> float:
+    """Mean fraction of the masks that the visual hull fills."""
+    whole = [v for v in views if not touches_border(masks[v.photo.name])]
+    return float(np.mean(agreement(masked_views(whole, masks))[1])) if len(whole) >= 2 else 0.0
 
 
 def completed_masks(views: Sequence[View], masks: dict[str, np.ndarray], box: np.ndarray) -> dict[str, np.ndarray]:

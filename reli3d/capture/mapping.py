@@ -51,6 +51,14 @@ class View:
         """Position ``(3,)`` of the camera."""
         return -self.rotation.T @ self.translation
 
+    @property
+    def c2w(self) -> np.ndarray:
+        """Camera to world ``(4, 4)`` in OpenGL axes."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotation.T @ np.diag([1.0, -1.0, -1.0])
+        pose[:3, 3] = self.eye
+        return pose
+
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels ``(N, 2)`` of the photo and depths ``(N,)`` of ``points (N, 3)``, with the lens's distortion.
 

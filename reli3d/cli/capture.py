@@ -47,7 +47,8 @@ def parser() -> Parser:
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     try:
-        from reli3d.capture.capture import CaptureOptions, capture, summary
+        from reli3d.capture.capture import CaptureOptions, capture
+        from reli3d.capture.report import summary
     except ModuleNotFoundError as error:
         raise InputError(str(error.name), "is not installed: pip install 'reli3d[capture]'") from None
 

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from reli3d.capture import capture as function
+from reli3d.capture.report import CaptureReport
 from reli3d.cli import infer
 from reli3d.cli.capture import main
 from tests.support.processes import heed_signals
@@ -55,7 +56,7 @@ def test_a_missing_extra_is_named_with_the_command_that_installs_it(tmp_path):
 def test_the_exit_code_is_that_of_the_reconstruction_or_of_its_silhouettes(
     tmp_path, monkeypatch, capsys, code, iou, expected
 ):
-    report = function.CaptureReport(20, registered=20)
+    report = CaptureReport(20, registered=20)
 
     def reconstruct(argv):
         target = tmp_path / "out" / "asset" / "out"

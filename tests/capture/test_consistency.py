@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from reli3d.capture.capture import _as_views
-from reli3d.capture.consistency import aligned, completed_masks
+from reli3d.capture.consistency import aligned, completed_masks, masked_views
 from reli3d.capture.mapping import View
 from reli3d.capture.rigidity import Frame, Group
 from tests.support.mapped import SIZE, view
@@ -53,7 +52,7 @@ def test_the_motion_between_two_groups_of_views_is_found_by_their_silhouettes():
     turn = Rotation.from_rotvec(np.radians([1.0, -1.5, 1.0])).as_matrix()
     wrong = Frame(0.98, turn, np.array([0.02, -0.03, 0.025]))  # of an object whose longest side is 0.8
     moved = [Group(wrong.scale, wrong.turn, wrong.shift, ()).moved(v) for v in others]
-    found = aligned(_as_views(fixed, masks), _as_views(moved, masks))
+    found = aligned(masked_views(fixed, masks), masked_views(moved, masks))
     corners = np.array(np.meshgrid(*BOX.T)).reshape(3, -1).T
     before = np.linalg.norm(wrong.apply(corners) - corners, axis=1)
     after = np.linalg.norm(found.apply(wrong.apply(corners)) - corners, axis=1)
@@ -65,7 +64,7 @@ def test_a_turn_that_no_silhouette_shows_stays_as_it_is():
     fixed, others, masks = pair_of_groups(((0.0, 0.0, 0.1, 0.35),))
     shift = np.array([0.02, 0.0, -0.02])
     moved = [Group(1.0, np.eye(3), shift, ()).moved(v) for v in others]
-    found = aligned(_as_views(fixed, masks), _as_views(moved, masks))
+    found = aligned(masked_views(fixed, masks), masked_views(moved, masks))
     assert np.degrees(Rotation.from_matrix(found.turn).magnitude()) < 0.5
     middle = np.array([0.0, 0.0, 0.1])
     np.testing.assert_allclose(found.apply(middle + shift), middle, atol=0.004)
@@ -74,7 +73,7 @@ def test_a_turn_that_no_silhouette_shows_stays_as_it_is():
 def test_groups_whose_masks_have_no_common_point_stay_where_they_are():
     fixed, others, masks = pair_of_groups()
     masks |= silhouettes(others[::2], ((-0.25, -0.3, 0.45, 0.05),))
-    found = aligned(_as_views(fixed, masks), _as_views(others, masks))
+    found = aligned(masked_views(fixed, masks), masked_views(others, masks))
     assert found.scale == 1.0 and np.array_equal(found.turn, np.eye(3)) and not found.shift.any()
 
 

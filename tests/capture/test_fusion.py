@@ -7,10 +7,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from reli3d.capture import capture, fusion
+from reli3d.capture import fusion
+from reli3d.capture.consistency import hull_agreement
 from reli3d.capture.fusion import fused_masks
 from reli3d.capture.mapping import Map, View
+from reli3d.capture.moving import SURE_AGREEMENT, Segmented, refined
 from reli3d.capture.photos import Photo
+from reli3d.capture.report import CaptureReport
 from reli3d.capture.rigidity import Frame
 from reli3d.capture.scene import Plane, Scene
 from tests.support.mapped import view
@@ -82,9 +85,9 @@ def test_masks_that_lack_half_of_a_gray_object_are_completed():
 def test_a_contact_shadow_in_masks_that_agree_becomes_texture_of_the_plane():
     found, scene, pairs = gray_scene(shadow=0.7)
     masks = {v.photo.name: (mask | shadow).astype(np.uint8) * 255 for v, mask, shadow in pairs}
-    assert capture._agreement(found.views, masks) > capture.SURE_AGREEMENT
-    segmented, report = capture._Segmented(found, masks), capture.CaptureReport(len(pairs))
-    final, _, _ = capture._refined(segmented, scene, None, report, lambda *_: None)
+    assert hull_agreement(found.views, masks) > SURE_AGREEMENT
+    segmented, report = Segmented(found, masks), CaptureReport(len(pairs))
+    final, _, _ = refined(segmented, scene, None, report, lambda *_: None)
     result = {name: mask > 127 for name, mask in final.masks.items()}
     left = [(result[v.photo.name] & shadow).sum() / shadow.sum() for v, _, shadow in pairs]
     assert np.mean(left) < 0.1  # a pixel along the ball; 0.36 with COVERED 0.5, 0.7 if masks limit the texture

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from reli3d.capture import capture as function
+from reli3d.capture import moving
 from reli3d.capture.mapping import Map, View
+from reli3d.capture.report import CaptureReport
 from reli3d.capture.rigidity import Group, completed_groups, epipolar_fit, on_turntable, rigid_groups
 from reli3d.capture.scene import Scene
 from reli3d.errors import InputError
@@ -119,7 +121,8 @@ def test_views_that_are_cut_off_are_not_the_reason_where_the_object_moves(moved,
             return first
         raise InputError("photographs", "expected images that overlap")
 
-    monkeypatch.setattr(function, "map_photos", mapped)
+    for module in (function, moving):
+        monkeypatch.setattr(module, "map_photos", mapped)
     options = function.CaptureOptions(masks=tmp_path / "masks", turntable=False)
     with pytest.raises(InputError, match="something else moves" if moved else "step back"):
         function.capture(tmp_path / "photographs", tmp_path / "object", options)
@@ -146,13 +149,13 @@ def test_what_moves_around_the_object_is_left_out_of_a_second_map(monkeypatch):
             raise InputError("photographs", "expected images that overlap")
         return second
 
-    monkeypatch.setattr(function, "map_photos", mapped)
+    monkeypatch.setattr(moving, "map_photos", mapped)
     fit = epipolar_fit(first, masks, inside=False)
     assert fit < 0.8 and epipolar_fit(first, masks) > 0.97
     for expected, surroundings, failed in ((second, fit, 0), (first, fit, 1), (first, 0.9, 0)):
-        report = function.CaptureReport(12, surroundings_fit=surroundings)
-        segmented = function._Segmented(first, masks)
-        result, _ = function._without_moving(segmented, scene, masks, report, lambda *_: None)
+        report = CaptureReport(12, surroundings_fit=surroundings)
+        segmented = moving.Segmented(first, masks)
+        result, _ = moving.without_moving(segmented, scene, masks, report, lambda *_: None)
         assert result.found is expected and len(report.failed) == failed and len(report.notes) == 1 - failed
     for region, pixels in zip(regions, shown, strict=False):
         found = region[tuple(pixels.astype(int).T[::-1])] > 0

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from reli3d.capture.capture import widest_gap
 from reli3d.capture.masks import cleaned, key_mask, moving_region, touches_border
+from reli3d.capture.report import widest_gap
 from reli3d.capture.scene import find_plane
 
 

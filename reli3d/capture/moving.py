@@ -1,0 +1,238 @@
+"""Maps of scenes in which the object, or something around it, moved between images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from reli3d.capture.consistency import aligned, hull_agreement, masked_views
+from reli3d.capture.fusion import fused_masks
+from reli3d.capture.mapping import Map, View, map_photos, shown_pixels
+from reli3d.capture.masks import grabcut_mask, is_empty, touches_border
+from reli3d.capture.photos import FEWEST, Progress
+from reli3d.capture.report import LEAST_FIT, CaptureReport
+from reli3d.capture.rigidity import SMALLEST_GROUP, Group, completed_groups, epipolar_fit, rigid_groups
+from reli3d.capture.scene import Scene, find_scene
+from reli3d.errors import InputError
+
+SURE_AGREEMENT = 0.99  # mean fraction of the masks that the hull fills, above which they lack nothing
+RIGID_FIT = 0.95  # of the matches that fit pairs of views: cameras that fit more are right
+KEPT_FRACTION = 0.9  # of the first map's images that the second must register
+SAME_UP = math.cos(math.radians(15.0))  # between the upward directions of views that saw the object in one pose
+
+
+@dataclass(frozen=True)
+class Segmented:
+    """A map and the masks of its views, by name."""
+
+    found: Map
+    masks: dict[str, np.ndarray]
+
+    @property
+    def views(self) -> list[View]:
+        return [v for v in self.found.views if v.photo.name in self.masks]
+
+
+def segmented_masks(
+    found: Map, scene: Scene, known: dict | None, progress: Progress, support: dict[str, np.ndarray] | None = None
+) -> dict[str, np.ndarray]:
+    """Masks of the views of a map by the names of their photos, of those that have one.
+
+    known: masks that replace those by the map's points.  support: pixels ``(N, 2)`` of points of the support by name;
+    None takes those of ``scene``.
+    """
+    if known is not None:
+        return {v.photo.name: known[v.photo.name] for v in found.views if v.photo.name in known}
+    masks = {}
+    for k, view in enumerate(found.views):
+        progress("masks", k, len(found.views))
+        seeds = None if support is None else support.get(view.photo.name, np.zeros((0, 2)))
+        mask = grabcut_mask(view, found, scene, seeds)
+        if mask is not None:
+            masks[view.photo.name] = mask
+    progress("masks", len(found.views), len(found.views))
+    return _not_empty(masks)
+
+
+def _not_empty(masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: mask for name, mask in masks.items() if not is_empty(mask)}
+
+
+def without_moving(
+    segmented: Segmented, scene: Scene, known: dict | None, report: CaptureReport, progress: Progress
+) -> tuple[Segmented, Scene]:
+    """The map with its masks, and the scene, of features inside the masks and on the support alone.
+
+    Unchanged where nothing moves, where the object itself was moved, and where these features are too few.
+    """
+    first, masks = segmented.found, segmented.masks
+    if report.surroundings_fit >= RIGID_FIT or epipolar_fit(first, masks) < RIGID_FIT:
+        return segmented, scene
+    regions = [_still_region(v, first.points[scene.support], masks.get(v.photo.name)) for v in first.views]
+    second = None
+    with suppress(InputError):
+        second = map_photos([v.photo for v in first.views], progress, regions)
+    if second and len(second.views) >= KEPT_FRACTION * len(first.views) and epipolar_fit(second, masks) >= RIGID_FIT:
+        again = find_scene(second)
+        renewed = segmented_masks(second, again, known, progress)
+        if len(renewed) >= KEPT_FRACTION * len(masks):
+            report.notes.append(
+                "matches around the object do not fit the cameras, as where something moves: "
+                "features of the object and its support are used"
+            )
+            report.surroundings_fit = epipolar_fit(second, renewed, inside=False)
+            return Segmented(second, renewed), again
+    fit = f"{100 * report.surroundings_fit:.0f} % of the matches around the object fit the cameras"
+    if report.surroundings_fit < LEAST_FIT:
+        report.failed.append(f"{fit}, at least 80 % expected: something moves there")
+    else:
+        report.notes.append(f"{fit}: if something moves there, the cameras may be inaccurate")
+    return segmented, scene
+
+
+def _still_region(view: View, support: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """``(H, W)`` uint8, 255 inside the mask and at the points ``support (N, 3)``."""
+    shape = view.photo.size[::-1]
+    x, y, _ = shown_pixels(*view.project(support), shape)
+    region = np.zeros(shape, np.uint8) if mask is None else mask.copy()
+    region[y, x] = 255
+    return region
+
+
+def refined(
+    segmented: Segmented, scene: Scene, known: dict | None, report: CaptureReport, progress: Progress
+) -> tuple[Segmented, np.ndarray, float | None]:
+    """The map in whose frame the object does not move, with its masks; in it the upward direction ``(3,)`` and the
+    ground's height along it (None: unknown).
+
+    Where matches inside the masks do not fit the cameras, or masks disagree, their features are mapped alone.  If
+    the two maps differ by more than a similarity, and these features fit the second one better, the object was moved.
+    The first map, if matches outside the masks fit it, still has the better lenses, and the better cameras within each
+    group of views between which the object did not move.  The masks are fused, per group for a moved object, and then
+    align the groups.  Masks that agree only lose contact shadows.
+    """
+    first, masks = segmented.found, segmented.masks
+    report.epipolar_fit = epipolar_fit(first, masks)
+    consistent = hull_agreement(segmented.views, masks) > SURE_AGREEMENT
+    moved = None
+    if report.epipolar_fit < RIGID_FIT or not consistent:
+        moved = _map_of_moved_object(segmented, report, progress)
+    if moved is None:
+        if known is None and report.epipolar_fit >= RIGID_FIT:
+            fused = fused_masks(first, scene, masks)
+            if consistent:  # the masks lack nothing, but may hold a contact shadow
+                fused = {name: np.minimum(mask, fused[name]) for name, mask in masks.items()}
+            segmented = Segmented(first, _not_empty(fused))
+        return segmented, _upward(first, scene), -scene.plane.offset if scene.plane else None
+    report.notes.append("the object was moved relative to its surroundings: its own features decide on the cameras")
+    second, groups = moved
+    by_name = {v.photo.name: v for v in first.views}
+    masks = _masks_of_moved_object(segmented, scene, second, groups, known, progress)
+    result = Segmented(_posed(second, _aligned_groups(groups, by_name, masks), by_name), masks)
+    if groups and scene.plane:
+        up = groups[0].turn @ _upward(first, scene)
+        return result, up, float(groups[0].apply(scene.plane.foot(scene.center)) @ up)
+    turns = np.stack([v.rotation.T @ by_name[v.photo.name].rotation for v in second.views])
+    directions = turns @ _upward(first, scene)
+    similar = directions @ directions.T > SAME_UP  # an object that was turned over has two: that of most views is up
+    upward = directions[similar[similar.sum(1).argmax()]].mean(0)
+    return result, upward / np.linalg.norm(upward), None
+
+
+def _upward(found: Map, scene: Scene) -> np.ndarray:
+    """Normal of the support plane, or the mean upward direction of the cameras, ``(3,)``."""
+    down = np.stack([v.rotation[1] for v in found.views]).mean(0)
+    return scene.plane.normal if scene.plane else -down / max(np.linalg.norm(down), 1e-9)
+
+
+def _map_of_moved_object(
+    segmented: Segmented, report: CaptureReport, progress: Progress
+) -> tuple[Map, list[Group]] | None:
+    """A map of the features inside the masks and the groups of views whose cameras it takes from the first map.
+
+    None if the object did not move, or if its features are too few; sets ``report.epipolar_fit``.
+    """
+    first, views, masks = segmented.found, segmented.views, segmented.masks
+    by_name = {v.photo.name: v for v in first.views}
+    lenses = first if report.surroundings_fit >= RIGID_FIT else None
+    try:
+        second = map_photos([v.photo for v in views], progress, [masks[v.photo.name] for v in views], lenses)
+    except InputError:
+        return None
+    groups, after = rigid_groups(first, second), 1.0
+    if not groups or len(groups[0].names) < KEPT_FRACTION * len(second.views):  # the maps differ: which is right?
+        same = replace(second, views=tuple(by_name[v.photo.name] for v in second.views))
+        report.epipolar_fit = min(report.epipolar_fit, epipolar_fit(same, masks, between=groups))
+        after = epipolar_fit(second, masks, between=groups)
+    if lenses and len(groups) > 1 and len(second.views) < len(views):
+        groups = completed_groups(first, groups, masks)
+        unseen = {name for group in groups for name in group.names} - {v.photo.name for v in second.views}
+        added = (replace(v, pixels=v.pixels[:0], points=v.points[:0]) for v in views if v.photo.name in unseen)
+        second = replace(second, views=(*second.views, *added))  # posed by their groups below
+    if (
+        len(second.views) < KEPT_FRACTION * len(first.views)
+        or report.epipolar_fit >= RIGID_FIT
+        or after <= report.epipolar_fit
+    ):
+        return None
+    report.epipolar_fit = after
+    groups = groups if lenses else []
+    return _posed(second, groups, by_name), groups
+
+
+def _masks_of_moved_object(
+    segmented: Segmented, scene: Scene, second: Map, groups: Sequence[Group], known: dict | None, progress: Progress
+) -> dict[str, np.ndarray]:
+    """Masks by name of the views of the map ``second`` of the object; those of the first map where they agree more."""
+    first, before = segmented.found, Segmented(second, segmented.masks)
+    support = {v.photo.name: v.pixels[scene.support[v.points]] for v in first.views}
+    own = find_scene(second, supported=False)
+    masks = segmented_masks(second, own, known, progress, support)
+    if known is None:  # in the first map, where the support and its shadows do not move within a group
+        by_name = {v.photo.name: v for v in first.views}
+        for group in (g for g in groups if len(g.names) >= FEWEST):
+            points = group.inverse(second.points[own.object])
+            at = replace(first, views=tuple(by_name[name] for name in group.names), points=points)
+            whole = replace(scene, object=np.ones(len(points), bool))
+            masks |= fused_masks(at, whole, {name: masks[name] for name in group.names if name in masks})
+        masks = _not_empty(masks)
+    enough = len(masks) >= KEPT_FRACTION * len(segmented.masks)
+    after = hull_agreement(Segmented(second, masks).views, masks) if enough else 0.0
+    if not enough or known is None and after < hull_agreement(before.views, before.masks):
+        masks = {v.photo.name: segmented.masks[v.photo.name] for v in before.views}
+    return masks
+
+
+def _posed(found: Map, groups: Sequence[Group], views: dict[str, View]) -> Map:
+    """``found`` with the poses of ``views`` in the groups, moved by these."""
+    moved = {name: group.moved(views[name]) for group in groups for name in group.names}
+    poses = [moved.get(v.photo.name, v) for v in found.views]
+    pairs = zip(found.views, poses, strict=True)
+    return replace(found, views=tuple(replace(v, rotation=p.rotation, translation=p.translation) for v, p in pairs))
+
+
+def _aligned_groups(groups: Sequence[Group], views: dict[str, View], masks: dict[str, np.ndarray]) -> list[Group]:
+    """The groups with motions corrected, one after the other, by the silhouettes of the groups before.
+
+    A correction that makes the visual hull of all these views fill less of the masks is left out.
+    """
+    whole = {name for name, mask in masks.items() if not touches_border(mask)}
+    before: list[View] = []
+    corrected = []
+    for group in groups:
+        names = [name for name in group.names if name in whole]
+        own = [group.moved(views[name]) for name in names]
+        if min(len(own), len(before)) >= SMALLEST_GROUP:
+            motion = aligned(masked_views(before, masks), masked_views(own, masks))
+            shift = motion.apply(group.shift)
+            better = replace(group, scale=motion.scale * group.scale, turn=motion.turn @ group.turn, shift=shift)
+            moved = [better.moved(views[name]) for name in names]
+            if hull_agreement(before + moved, masks) >= hull_agreement(before + own, masks):
+                group, own = better, moved
+        before += own
+        corrected.append(group)
+    return corrected
