@@ -1,4 +1,4 @@
-"""Photographs or a video of one object, without cameras, to an object folder with cameras and masks."""
+"""Writes an object folder with cameras and masks from photographs or a video of one object."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from PIL import Image
 from reli3d.capture.consistency import masked_views
 from reli3d.capture.mapping import View, map_photos
 from reli3d.capture.masks import is_empty, key_mask, moving_region, touches_border
-from reli3d.capture.moving import Segmented, refined, segmented_masks, without_moving
+from reli3d.capture.moving import Segmented, object_map, segmented_masks, without_moving
 from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
 from reli3d.capture.report import LEAST_FIT, LEAST_REGISTERED, SMALL_STEPS, CaptureReport, check, summary, widest_gap
 from reli3d.capture.rigidity import Frame, epipolar_fit, inside_mask, on_turntable
@@ -99,7 +99,7 @@ def capture(
     report.surroundings_fit = epipolar_fit(first, segmented.masks, inside=False)
     if region is None:
         segmented, scene = without_moving(segmented, scene, known, report, progress)
-    final, up, ground = refined(segmented, scene, known, report, progress)
+    final, up, ground = object_map(segmented, scene, known, report, progress)
     report.epipolar_fit, report.surroundings_fit = round(report.epipolar_fit, 3), round(report.surroundings_fit, 3)
     report.registered = len(final.found.views)
     registered = {v.photo.name for v in final.found.views}
@@ -107,7 +107,7 @@ def capture(
     report.separate = first.separate
     report.reprojection_error = round(final.found.mean_error, 3)
     report.plane = scene.plane is not None
-    views = _whole_views(source, final, report)
+    views = _consistent_views(source, final, report)
     if len(views) > MOST_VIEWS:
         taken = choose_views(torch.from_numpy(np.stack([v.c2w for v in views])), MOST_VIEWS)
         report.notes.append(f"{len(views)} views thinned to {MOST_VIEWS} by the distance between their cameras")
@@ -122,8 +122,7 @@ def capture(
     report.unit = "meter" if options.size else "longest side"
     inside = _object_points(final, views)
     report.object_points = len(inside)
-    middle = (box[0] + box[1]) / 2
-    report.gap = round(widest_gap(np.stack([frame.apply(v.eye) for v in views]) - middle), 1)
+    report.gap = round(widest_gap(np.stack([frame.apply(v.eye) for v in views]) - box.mean(0)), 1)
     check(report)
     _write(output, views, final.masks, frame, box, report, frame.apply(inside), progress)
     return report
@@ -198,7 +197,7 @@ def _given_mask(folder: Path, photo: Photo) -> np.ndarray | None:
     return cv2.resize(mask, photo.size, interpolation=cv2.INTER_AREA)
 
 
-def _whole_views(source: Path, final: Segmented, report: CaptureReport) -> list[View]:
+def _consistent_views(source: Path, final: Segmented, report: CaptureReport) -> list[View]:
     """Views that show the whole object and agree with the others; the rest is named in the report."""
     views = final.views
     for view in final.found.views:
@@ -233,7 +232,7 @@ def _whole_views(source: Path, final: Segmented, report: CaptureReport) -> list[
 
 
 def _least_compatible(views: Sequence[View], masks: dict[str, np.ndarray]) -> int:
-    """The view without which the hull of the others is fullest, where all together have none."""
+    """Index of the view without which the hull fills most of the masks, where the hull of all views is empty."""
     scores = []
     for k in range(len(views)):
         rest = [v for j, v in enumerate(views) if j != k]
@@ -254,10 +253,9 @@ def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float |
     x = side / np.linalg.norm(side) @ turn[::2]
     turn = np.stack([x, y, np.cross(x, y)])
     turned = hull @ turn.T
-    bottom = turned[:, 1].min() if ground is None else max(ground, turned[:, 1].min())
+    bottom = max(turned[:, 1].min(), -np.inf if ground is None else ground)
     above = turned[turned[:, 1] >= bottom]
     turned = above if len(above) > 0.2 * len(turned) else turned
-    bottom = max(bottom, turned[:, 1].min()) if ground is None else bottom
     low, high = turned.min(0), turned.max(0)
     scale = (1.0 if size is None else size / 1000.0) / float((high - low).max())
     middle = (low + high) / 2
@@ -267,10 +265,9 @@ def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float |
 
 def _object_points(final: Segmented, views: Sequence[View]) -> np.ndarray:
     """Points of the map that lie inside the masks of the views that observe them."""
-    hits, count = np.zeros(len(final.found.points)), np.zeros(len(final.found.points))
-    for view in views:
-        np.add.at(hits, view.points, inside_mask(final.masks[view.photo.name], view.pixels))
-        np.add.at(count, view.points, 1)
+    points = np.concatenate([v.points for v in views])
+    inside = np.concatenate([inside_mask(final.masks[v.photo.name], v.pixels) for v in views])
+    hits, count = (np.bincount(points, weights, len(final.found.points)) for weights in (inside, None))
     return final.found.points[(count >= 2) & (hits > 0.7 * count)]
 
 

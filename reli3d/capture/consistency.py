@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch.nn.functional import grid_sample, huber_loss, normalize, pad, softplus
 
-from reli3d.capture.mapping import View, shown_pixels
+from reli3d.capture.mapping import View, point_mask, shown_pixels
 from reli3d.capture.masks import full_size, touches_border
 from reli3d.capture.rigidity import Frame
 from reli3d.geometry.camera import Camera
@@ -18,7 +18,7 @@ from reli3d.views.check import agreement
 from reli3d.views.normalize import visual_hull
 from reli3d.views.views import Views
 
-MASK_SIDE = 512  # pixels of the masks by which a visual hull is judged
+MASK_SIDE = 512  # pixels along the longer side of the masks of visual hulls
 CELLS = 160  # along the longest side of the object
 MARGIN = 0.1  # of the longest side, around the box of the object
 SLAB = 8  # layers of cells at a time
@@ -32,7 +32,7 @@ OUTLINE_PIXELS = -0.5, 1.0  # signed distance of the pixels from which rays are 
 RAYS, RAY_SAMPLES = 2500, 48  # of each side; along a ray
 ALIGN_STEPS, ALIGN_STEP_SIZE = 60, 0.004  # of Adam; at first, in radians, of HULL_HALF_SIDE and of a logarithm
 HUBER_DELTA = 0.004  # of HULL_HALF_SIDE: residuals beyond count linearly
-MOTION_PENALTY = 0.0005  # of motions that no silhouette shows, such as turns about an axis of symmetry
+MOTION_PENALTY = 0.0005  # of motions that silhouettes do not constrain, such as rotations about an axis of symmetry
 
 
 def masked_views(views: Sequence[View], masks: dict[str, np.ndarray]) -> Views:
@@ -54,7 +54,9 @@ def masked_views(views: Sequence[View], masks: dict[str, np.ndarray]) -> Views:
 
 
 def hull_agreement(views: Sequence[View], masks: dict[str, np.ndarray]) -> float:
-    """Mean fraction of the masks that the visual hull fills."""
+    """Mean fraction of the masks that the visual hull fills, of the views whose masks do not touch the border; 0 if
+    these are fewer than two.
+    """
     whole = [v for v in views if not touches_border(masks[v.photo.name])]
     return float(np.mean(agreement(masked_views(whole, masks))[1])) if len(whole) >= 2 else 0.0
 
@@ -134,9 +136,9 @@ def _indices(view: View, points: np.ndarray, size: tuple[int, int]) -> np.ndarra
 
 def _shown(view: View, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Silhouette ``(H, W)`` uint8, 0 or 255, of cells of a pixel's size about ``points``."""
-    silhouette = np.zeros(size[0] * size[1] + 1, np.uint8)
-    silhouette[_indices(view, points, size)] = 255
-    return cv2.morphologyEx(silhouette[:-1].reshape(size[::-1]), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    pixels, depth = view.project(points)
+    silhouette = point_mask(pixels * (np.array(size) / view.photo.size), depth, size[::-1])
+    return cv2.morphologyEx(silhouette, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
 
 
 @torch.inference_mode(False)
@@ -164,9 +166,9 @@ def _explaining(pixels: np.ndarray, target: np.ndarray, weight: np.ndarray) -> n
 def aligned(fixed: Views, others: Views) -> Frame:
     """The similarity that moves the cameras of ``others`` to where their silhouettes agree with those of ``fixed``.
 
-    Minimizes, over rays along the outlines of either side, the distance by which they miss the visual hull of the
-    other side (silhouette coherence, Hernandez, Schmitt and Cipolla 2007): a ray through the object meets every
-    hull.  Converges from errors of a few percent of the object's size.  The identity where either hull is empty.
+    Minimizes the distance between the viewing rays along the outlines of either side and the visual hull of the other
+    (silhouette coherence, Hernandez, Schmitt and Cipolla 2007): a ray through the object meets every hull.  Converges
+    from errors of a few percent of the object's size.  The identity where either hull is empty.
     """
     hulls = [visual_hull(v) for v in (fixed, others)]
     if any(len(h.points) == 0 for h in hulls):

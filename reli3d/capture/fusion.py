@@ -1,7 +1,8 @@
-"""Masks from all views together: what the support plane looks like, and the object's colors, fused in a volume.
+"""Joint segmentation of all views: log odds of pixels, from the object's colors and the texture of the support plane,
+are fused in a volume.
 
-Where object and background have similar colors, one image does not show the outline.  Other views do: from above
-the object is in front of the plane, whose texture the views know from where it is not covered.
+Where object and background have similar colors, one image does not show the outline.  Other views do: from above,
+the object is in front of the plane, whose texture is known from the views that see it uncovered.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from reli3d.capture.consistency import completed_masks
-from reli3d.capture.mapping import Map, View, grown, shown_pixels
+from reli3d.capture.mapping import Map, View, grown, point_mask, shown_pixels
 from reli3d.capture.masks import COARSE_SIDE, full_size, grabcut, reduced, refined
 from reli3d.capture.rigidity import Frame
-from reli3d.capture.scene import PLANE_TOLERANCE, Scene
+from reli3d.capture.scene import Scene
 
 SIDES = COARSE_SIDE, COARSE_SIDE, 720  # pixels along the longer side of the images; memory limits the last
 TEXEL = 1.5  # pixels of the images, at the cameras' median distance
@@ -46,7 +47,7 @@ SHADOW_HEIGHT = 0.1, 0.4  # of the object's longest side and of its height: lowe
 POINT_REACH = 0.04  # of the object's longest side: cells so near to one of its points are no shadow
 CERTAIN_OBJECT = 3.0  # log odds from which GrabCut keeps a pixel whose neighbors have them too: evidence is blurred
 CERTAIN_BACKGROUND = 2.0  # the same of the background: GrabCut would add shadows of a color like the object
-CERTAIN_PLANE = 3.0  # the same before the prior, which only the plane's texture reaches
+CERTAIN_PLANE = 3.0  # the same without the prior of the silhouettes; only the plane's texture reaches it
 LIMIT_PIXELS = 12  # around the silhouette: farther out nothing is the object
 
 
@@ -73,15 +74,14 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     pass ends with GrabCut from the log odds of pixels and silhouettes; the last has larger images.
     :func:`completed_masks` adds parts that some masks lack.
     """
-    if scene.plane is None:
+    if scene.plane is None or not masks:
         return masks
     axes = Frame(1.0, scene.plane.axes.T, scene.plane.foot(scene.center))  # from the plane's axes to the map
     views = [v for v in found.views if v.photo.name in masks]
     inside = [masks[v.photo.name] for v in views]
     points = axes.inverse(found.points[scene.object])
     box = np.stack([np.minimum(points.min(0), [np.inf, np.inf, 0]), points.max(0)])
-    sure = cKDTree(points[points[:, 2] > 1.5 * PLANE_TOLERANCE * scene.distance])  # others may lie on a shadow
-    cover = inside
+    on_object, cover = cKDTree(points), inside
     for side, cells, growth in zip(SIDES, GRIDS, VOLUME_SIDE, strict=True):
         smalls = [_Small(v, *reduced(v.photo.pixels, side)) for v in views]
         inside, cover = (
@@ -96,7 +96,7 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
         box = np.stack([occupied.min(0), occupied.max(0)])
         longest = (box[1] - box[0]).max()
         high = occupied[:, 2] > min(SHADOW_HEIGHT[0] * longest, SHADOW_HEIGHT[1] * box[1, 2])
-        high |= sure.query(occupied)[0] < POINT_REACH * longest
+        high |= on_object.query(occupied)[0] < POINT_REACH * longest
         occupied = axes.apply(occupied)
         cover = [_silhouette(s, occupied[high], cell) for s in smalls]
         odds = [_with_prior(s, e, occupied, cell) for s, e in zip(smalls, evidence, strict=True)]
@@ -120,7 +120,7 @@ def _plane_texture(
 ) -> _Texture:
     """Median over views, after one gain for each view and channel, of what they show outside ``cover``.
 
-    Where FEWEST_SAMPLES of them show a texel outside the masks ``inside`` too, these alone are taken: ``cover`` lacks
+    Views that show a texel outside the masks ``inside`` too are preferred, if there are FEWEST_SAMPLES: ``cover`` lacks
     the low parts of the object.
     """
     cell = TEXEL * scene.distance / float(np.median([s.view.focal * s.scale for s in smalls]))
@@ -185,9 +185,9 @@ class _Expected:
     known: np.ndarray  # (H, W) bool
 
     def away(self, image: np.ndarray, gain: np.ndarray | float) -> np.ndarray:
-        """Distance ``(H, W, 3)`` between the colors of ``image`` and the plane's; a shift by one pixel is tolerated.
+        """Distance ``(H, W, 3)`` of the colors of ``image`` from the plane's, of the nearest pixels within one.
 
-        It is compared in both directions: a gray lies within the range of a print's colors, but not the reverse.
+        It is symmetric: a gray lies within the local range of a print's colors, but not the reverse.
         """
         image, plane = image.astype(np.float32), (self.color * gain).astype(np.float32)
         return np.maximum(_outside(image, plane), _outside(plane, image))
@@ -309,12 +309,10 @@ def _occupied(smalls, evidence, axes: Frame, box, points, cells: int, growth: fl
 def _silhouette(small: _Small, centers: np.ndarray, cell: float) -> np.ndarray:
     """``(H, W)`` uint8, 255 where the view shows the cells of size ``cell`` about ``centers (N, 3)``."""
     pixels, depth = small.project(centers)
-    x, y, shown = shown_pixels(pixels, depth, small.image.shape)
-    silhouette = np.zeros(small.image.shape[:2], np.uint8)
-    silhouette[y, x] = 255
-    if len(x) == 0:
+    silhouette = point_mask(pixels, depth, small.image.shape)
+    if not silhouette.any():
         return silhouette
-    width = int(np.ceil(small.view.focal * small.scale * cell / np.median(depth[shown]))) + 2
+    width = int(np.ceil(small.view.focal * small.scale * cell / np.median(depth[depth > 0]))) + 2
     return cv2.morphologyEx(silhouette, cv2.MORPH_CLOSE, np.ones((width, width), np.uint8))
 
 

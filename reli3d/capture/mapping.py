@@ -109,9 +109,17 @@ def shown_pixels(
     return x[shown], y[shown], shown
 
 
+def point_mask(pixels: np.ndarray, depth: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """``(H, W)`` uint8, 255 at the pixels that ``pixels (N, 2)`` inside an image of ``shape`` lie in."""
+    mask = np.zeros(shape[:2], np.uint8)
+    x, y, _ = shown_pixels(pixels, depth, shape)
+    mask[y, x] = 255
+    return mask
+
+
 @dataclass(frozen=True)
 class Map:
-    """Registered views, points with their mean reprojection errors, and matched features of pairs of views.
+    """A reconstruction: registered views, points with mean reprojection errors, and matched features of view pairs.
 
     matches: indices of two views and the pixels ``(M, 2)`` in each, as the descriptors match them: no geometry is used.
     separate: number of other images that form a map of their own.

@@ -11,18 +11,18 @@ import numpy as np
 
 from reli3d.capture.consistency import aligned, hull_agreement, masked_views
 from reli3d.capture.fusion import fused_masks
-from reli3d.capture.mapping import Map, View, map_photos, shown_pixels
+from reli3d.capture.mapping import Map, View, map_photos, point_mask
 from reli3d.capture.masks import grabcut_mask, is_empty, touches_border
-from reli3d.capture.photos import FEWEST, Progress
+from reli3d.capture.photos import FEWEST, Photo, Progress
 from reli3d.capture.report import LEAST_FIT, CaptureReport
 from reli3d.capture.rigidity import SMALLEST_GROUP, Group, completed_groups, epipolar_fit, rigid_groups
 from reli3d.capture.scene import Scene, find_scene
 from reli3d.errors import InputError
 
-SURE_AGREEMENT = 0.99  # mean fraction of the masks that the hull fills, above which they lack nothing
-RIGID_FIT = 0.95  # of the matches that fit pairs of views: cameras that fit more are right
-KEPT_FRACTION = 0.9  # of the first map's images that the second must register
-SAME_UP = math.cos(math.radians(15.0))  # between the upward directions of views that saw the object in one pose
+COMPLETE_AGREEMENT = 0.99  # mean fraction filled by the hull above which masks count as complete
+RIGID_FIT = 0.95  # least epipolar fit of correct cameras
+KEPT_FRACTION = 0.9  # least fraction of the views, or of the masks, that a second map keeps
+SAME_UP = math.cos(math.radians(15.0))  # between the upward directions of views of the object in one pose
 
 
 @dataclass(frozen=True)
@@ -65,24 +65,25 @@ def _not_empty(masks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def without_moving(
     segmented: Segmented, scene: Scene, known: dict | None, report: CaptureReport, progress: Progress
 ) -> tuple[Segmented, Scene]:
-    """The map with its masks, and the scene, of features inside the masks and on the support alone.
+    """The map of the features inside the masks and on the support alone, with its masks, and its scene.
 
-    Unchanged where nothing moves, where the object itself was moved, and where these features are too few.
+    Returns the input if the matches around the object fit the cameras, if the object itself was moved, or if too few
+    images are registered or have masks.
     """
     first, masks = segmented.found, segmented.masks
     if report.surroundings_fit >= RIGID_FIT or epipolar_fit(first, masks) < RIGID_FIT:
         return segmented, scene
-    regions = [_still_region(v, first.points[scene.support], masks.get(v.photo.name)) for v in first.views]
-    second = None
-    with suppress(InputError):
-        second = map_photos([v.photo for v in first.views], progress, regions)
+    support = first.points[scene.support]
+    regions = [point_mask(*v.project(support), v.photo.size[::-1]) for v in first.views]
+    regions = [np.maximum(r, masks.get(v.photo.name, 0)) for r, v in zip(regions, first.views, strict=True)]
+    second = _mapped([v.photo for v in first.views], progress, regions)
     if second and len(second.views) >= KEPT_FRACTION * len(first.views) and epipolar_fit(second, masks) >= RIGID_FIT:
         again = find_scene(second)
         renewed = segmented_masks(second, again, known, progress)
         if len(renewed) >= KEPT_FRACTION * len(masks):
             report.notes.append(
-                "matches around the object do not fit the cameras, as where something moves: "
-                "features of the object and its support are used"
+                "matches around the object do not fit the cameras (something moves there): only features on the object "
+                "and its support are used"
             )
             report.surroundings_fit = epipolar_fit(second, renewed, inside=False)
             return Segmented(second, renewed), again
@@ -94,41 +95,43 @@ def without_moving(
     return segmented, scene
 
 
-def _still_region(view: View, support: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """``(H, W)`` uint8, 255 inside the mask and at the points ``support (N, 3)``."""
-    shape = view.photo.size[::-1]
-    x, y, _ = shown_pixels(*view.project(support), shape)
-    region = np.zeros(shape, np.uint8) if mask is None else mask.copy()
-    region[y, x] = 255
-    return region
+def _mapped(
+    photos: list[Photo], progress: Progress, regions: list[np.ndarray], lenses: Map | None = None
+) -> Map | None:
+    """:func:`map_photos`, or None where it finds no map."""
+    with suppress(InputError):
+        return map_photos(photos, progress, regions, lenses)
+    return None
 
 
-def refined(
+def object_map(
     segmented: Segmented, scene: Scene, known: dict | None, report: CaptureReport, progress: Progress
 ) -> tuple[Segmented, np.ndarray, float | None]:
-    """The map in whose frame the object does not move, with its masks; in it the upward direction ``(3,)`` and the
-    ground's height along it (None: unknown).
+    """The map in the object's frame with its masks, the upward direction ``(3,)`` and the ground's height along it
+    (None: unknown).
 
-    Where matches inside the masks do not fit the cameras, or masks disagree, their features are mapped alone.  If
-    the two maps differ by more than a similarity, and these features fit the second one better, the object was moved.
-    The first map, if matches outside the masks fit it, still has the better lenses, and the better cameras within each
-    group of views between which the object did not move.  The masks are fused, per group for a moved object, and then
-    align the groups.  Masks that agree only lose contact shadows.
+    If matches inside the masks do not fit the cameras, or the masks disagree, these features are mapped separately.
+    The object was moved if no similarity relates the two maps and its matches fit the second one better.  The
+    intrinsics, and the relative poses within each group of views between which the object did not move, are then those
+    of the first map, if the matches outside the masks fit it.  The masks are fused, in each group of a moved object,
+    and then align the groups.  Consistent masks only lose pixels.
     """
     first, masks = segmented.found, segmented.masks
     report.epipolar_fit = epipolar_fit(first, masks)
-    consistent = hull_agreement(segmented.views, masks) > SURE_AGREEMENT
+    consistent = hull_agreement(segmented.views, masks) > COMPLETE_AGREEMENT
     moved = None
     if report.epipolar_fit < RIGID_FIT or not consistent:
         moved = _map_of_moved_object(segmented, report, progress)
     if moved is None:
         if known is None and report.epipolar_fit >= RIGID_FIT:
             fused = fused_masks(first, scene, masks)
-            if consistent:  # the masks lack nothing, but may hold a contact shadow
+            if consistent:  # the masks are complete, but may contain a contact shadow
                 fused = {name: np.minimum(mask, fused[name]) for name, mask in masks.items()}
             segmented = Segmented(first, _not_empty(fused))
         return segmented, _upward(first, scene), -scene.plane.offset if scene.plane else None
-    report.notes.append("the object was moved relative to its surroundings: its own features decide on the cameras")
+    report.notes.append(
+        "the object was moved relative to its surroundings: cameras are estimated from features on the object"
+    )
     second, groups = moved
     by_name = {v.photo.name: v for v in first.views}
     masks = _masks_of_moved_object(segmented, scene, second, groups, known, progress)
@@ -138,33 +141,34 @@ def refined(
         return result, up, float(groups[0].apply(scene.plane.foot(scene.center)) @ up)
     turns = np.stack([v.rotation.T @ by_name[v.photo.name].rotation for v in second.views])
     directions = turns @ _upward(first, scene)
-    similar = directions @ directions.T > SAME_UP  # an object that was turned over has two: that of most views is up
+    similar = directions @ directions.T > SAME_UP  # of an object that was turned over, take the direction of most views
     upward = directions[similar[similar.sum(1).argmax()]].mean(0)
     return result, upward / np.linalg.norm(upward), None
 
 
 def _upward(found: Map, scene: Scene) -> np.ndarray:
     """Normal of the support plane, or the mean upward direction of the cameras, ``(3,)``."""
+    if scene.plane:
+        return scene.plane.normal
     down = np.stack([v.rotation[1] for v in found.views]).mean(0)
-    return scene.plane.normal if scene.plane else -down / max(np.linalg.norm(down), 1e-9)
+    return -down / max(np.linalg.norm(down), 1e-9)
 
 
 def _map_of_moved_object(
     segmented: Segmented, report: CaptureReport, progress: Progress
 ) -> tuple[Map, list[Group]] | None:
-    """A map of the features inside the masks and the groups of views whose cameras it takes from the first map.
+    """The map of the features inside the masks, and the groups of views with relative poses of the first map.
 
     None if the object did not move, or if its features are too few; sets ``report.epipolar_fit``.
     """
     first, views, masks = segmented.found, segmented.views, segmented.masks
     by_name = {v.photo.name: v for v in first.views}
     lenses = first if report.surroundings_fit >= RIGID_FIT else None
-    try:
-        second = map_photos([v.photo for v in views], progress, [masks[v.photo.name] for v in views], lenses)
-    except InputError:
+    second = _mapped([v.photo for v in views], progress, [masks[v.photo.name] for v in views], lenses)
+    if second is None:
         return None
     groups, after = rigid_groups(first, second), 1.0
-    if not groups or len(groups[0].names) < KEPT_FRACTION * len(second.views):  # the maps differ: which is right?
+    if not groups or len(groups[0].names) < KEPT_FRACTION * len(second.views):  # no similarity
         same = replace(second, views=tuple(by_name[v.photo.name] for v in second.views))
         report.epipolar_fit = min(report.epipolar_fit, epipolar_fit(same, masks, between=groups))
         after = epipolar_fit(second, masks, between=groups)
@@ -187,7 +191,7 @@ def _map_of_moved_object(
 def _masks_of_moved_object(
     segmented: Segmented, scene: Scene, second: Map, groups: Sequence[Group], known: dict | None, progress: Progress
 ) -> dict[str, np.ndarray]:
-    """Masks by name of the views of the map ``second`` of the object; those of the first map where they agree more."""
+    """Masks by name of the views of ``second``, the object's map; those of the first map if they agree better."""
     first, before = segmented.found, Segmented(second, segmented.masks)
     support = {v.photo.name: v.pixels[scene.support[v.points]] for v in first.views}
     own = find_scene(second, supported=False)
@@ -200,9 +204,10 @@ def _masks_of_moved_object(
             whole = replace(scene, object=np.ones(len(points), bool))
             masks |= fused_masks(at, whole, {name: masks[name] for name in group.names if name in masks})
         masks = _not_empty(masks)
-    enough = len(masks) >= KEPT_FRACTION * len(segmented.masks)
-    after = hull_agreement(Segmented(second, masks).views, masks) if enough else 0.0
-    if not enough or known is None and after < hull_agreement(before.views, before.masks):
+    if len(masks) < KEPT_FRACTION * len(segmented.masks) or (
+        known is None
+        and hull_agreement(Segmented(second, masks).views, masks) < hull_agreement(before.views, before.masks)
+    ):
         masks = {v.photo.name: segmented.masks[v.photo.name] for v in before.views}
     return masks
 

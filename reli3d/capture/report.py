@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 SIDE_ELEVATION = 45.0  # degrees up to which a direction looks at a side of the object
-LEAST_REGISTERED, MOST_ERROR, WIDEST_GAP = 0.8, 1.0, 60.0
+LEAST_REGISTERED, MAX_MEAN_ERROR, WIDEST_GAP = 0.8, 1.0, 60.0
 LEAST_POINTS, LEAST_AGREEMENT, LEAST_MASK, LEAST_FIT = 200, 0.85, 0.03, 0.8
 SMALL_STEPS = "take sharp images of one object in small steps around it"
 
@@ -20,15 +20,17 @@ class CaptureReport:
     images: int
     registered: int = 0
     lost: list[str] = field(default_factory=list)  # not registered
-    separate: int = 0  # of these, images that form a second map, as of another object or after a gap
-    left_out: dict[str, str] = field(default_factory=dict)  # registered, but of no use: name and reason
+    separate: int = 0  # of these, images of the largest other map, as of another object or after a gap
+    left_out: dict[str, str] = field(default_factory=dict)  # registered, but excluded: name and reason
     views: list[str] = field(default_factory=list)
     reprojection_error: float = 0.0  # pixels, mean
     object_points: int = 0
     gap: float = 0.0  # degrees, the widest between cameras around the object
     agreement: float = 0.0  # median fraction of a mask that the visual hull fills
     epipolar_fit: float = 1.0  # matches on the object that fit the cameras, over those that fit pairs of views
-    surroundings_fit: float = 1.0  # the same around it; of the first map, where the object was moved
+    surroundings_fit: float = (
+        1.0  # the same of the matches outside the masks; of the first map, if the object was moved
+    )
     mask_fraction: float = 0.0  # median fraction of an image that the mask covers
     mask_method: str = ""
     plane: bool = False
@@ -59,33 +61,35 @@ def check(report: CaptureReport) -> None:
     checks = (
         (
             registered >= LEAST_REGISTERED,
-            f"{100 * registered:.0f} % of the images registered, at least 80 % expected; "
+            f"{100 * registered:.0f} % of the images registered, at least {100 * LEAST_REGISTERED:.0f} % expected; "
             + (f"{report.separate} others fit together (a second object, or a gap); " if report.separate else "")
             + SMALL_STEPS,
         ),
-        (error < MOST_ERROR, f"reprojection error {error} px, below 1 expected"),
+        (error < MAX_MEAN_ERROR, f"reprojection error {error} px, below {MAX_MEAN_ERROR:.0f} expected"),
         (
             report.epipolar_fit >= LEAST_FIT,
-            f"{100 * report.epipolar_fit:.0f} % of the matches on the object fit the cameras, at least 80 % expected: "
-            "the object was moved relative to its surroundings",
+            f"{100 * report.epipolar_fit:.0f} % of the matches on the object fit the cameras, at least "
+            f"{100 * LEAST_FIT:.0f} % expected: the object was moved relative to its surroundings",
         ),
         (
             report.gap < WIDEST_GAP,
-            f"no view within a sector of {math.floor(report.gap)} degrees, at most 60 expected; add images from there",
+            f"no view within a sector of {math.floor(report.gap)} degrees, at most {WIDEST_GAP:.0f} expected; "
+            "add images from there",
         ),
         (
             report.object_points >= LEAST_POINTS,
-            f"{report.object_points} points on the object, at least 200 expected: it lacks texture, or is not the same "
-            "object in all images",
+            f"{report.object_points} points on the object, at least {LEAST_POINTS} expected: it lacks texture, "
+            "or is not the same object in all images",
         ),
         (
             report.agreement >= LEAST_AGREEMENT,
-            f"the visual hull fills {100 * report.agreement:.0f} % of a mask, at least 85 % expected: masks lack "
-            "a part of the object; give --masks or --mask-method rembg",
+            f"the visual hull fills {100 * report.agreement:.0f} % of a mask, at least {100 * LEAST_AGREEMENT:.0f} % "
+            "expected: masks lack a part of the object; give --masks or --mask-method rembg",
         ),
         (
             report.mask_fraction >= LEAST_MASK,
-            f"the object covers {100 * report.mask_fraction:.1f} % of an image, at least 3 % expected",
+            f"the object covers {100 * report.mask_fraction:.1f} % of an image, at least {100 * LEAST_MASK:.0f} % "
+            "expected",
         ),
     )
     report.failed += [text for passed, text in checks if not passed]

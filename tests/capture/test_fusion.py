@@ -11,7 +11,7 @@ from reli3d.capture import fusion
 from reli3d.capture.consistency import hull_agreement
 from reli3d.capture.fusion import fused_masks
 from reli3d.capture.mapping import Map, View
-from reli3d.capture.moving import SURE_AGREEMENT, Segmented, refined
+from reli3d.capture.moving import COMPLETE_AGREEMENT, Segmented, object_map
 from reli3d.capture.photos import Photo
 from reli3d.capture.report import CaptureReport
 from reli3d.capture.rigidity import Frame
@@ -85,9 +85,9 @@ def test_masks_that_lack_half_of_a_gray_object_are_completed():
 def test_a_contact_shadow_in_masks_that_agree_becomes_texture_of_the_plane():
     found, scene, pairs = gray_scene(shadow=0.7)
     masks = {v.photo.name: (mask | shadow).astype(np.uint8) * 255 for v, mask, shadow in pairs}
-    assert hull_agreement(found.views, masks) > SURE_AGREEMENT
+    assert hull_agreement(found.views, masks) > COMPLETE_AGREEMENT
     segmented, report = Segmented(found, masks), CaptureReport(len(pairs))
-    final, _, _ = refined(segmented, scene, None, report, lambda *_: None)
+    final, _, _ = object_map(segmented, scene, None, report, lambda *_: None)
     result = {name: mask > 127 for name, mask in final.masks.items()}
     left = [(result[v.photo.name] & shadow).sum() / shadow.sum() for v, _, shadow in pairs]
     assert np.mean(left) < 0.1  # a pixel along the ball; 0.36 with COVERED 0.5, 0.7 if masks limit the texture
@@ -99,7 +99,7 @@ def test_a_low_part_that_points_of_the_object_lie_on_is_no_shadow():
     found, scene, pairs = gray_scene(shadow=0.0)
     masks = {v.photo.name: (mask | low).astype(np.uint8) * 255 for v, mask, low in pairs}
     u, v = np.mgrid[-SHADOW:SHADOW:5, -SHADOW:SHADOW:5].reshape(2, -1) / 100
-    disk = np.stack([u, v, np.full(u.shape, 0.03 - RADIUS)], -1)[np.hypot(u, v) < SHADOW / 100]
+    disk = np.stack([u, v, np.full(u.shape, 0.01 - RADIUS)], -1)[np.hypot(u, v) < SHADOW / 100]
     points = np.concatenate([found.points, disk])
     count = len(points)
     found = replace(found, points=points, error=np.zeros(count), tracks=np.full(count, 3))
@@ -107,6 +107,11 @@ def test_a_low_part_that_points_of_the_object_lie_on_is_no_shadow():
     result = fused_masks(found, scene, masks)
     left = [((result[v.photo.name] > 127) & low).sum() / low.sum() for v, _, low in pairs]
     assert np.mean(left) > 0.9, left
+
+
+def test_without_masks_there_is_nothing_to_fuse():
+    found, scene, _ = gray_scene()
+    assert fused_masks(found, scene, {}) == {}
 
 
 def test_masks_of_a_pixel_leave_no_colors_and_are_accepted():
