@@ -72,10 +72,6 @@ class Illumination(nn.Module):
         of_planes = planes.movedim(2, -1).flatten(1, 3)  # plane by plane, row by row
         context = torch.cat([views, self.plane_tokens["output_projection"](of_planes)], dim=1)
         tokens = self.bank["embeddings"].t().expand(len(images), -1, -1)
-        return unpack(self.transformer(tokens, context).float(), self.latents)
-
-
-def unpack(tokens: Tensor, latents: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Latents ``(B, L, 3)``, rotation ``(B, 3, 3)``, strength ``(B,)``: the first numbers of ``(B, C, N)``."""
-    latent, strength, rotation = tokens.flatten(1)[:, : 3 * latents + 7].split((3 * latents, 1, 6), dim=1)
-    return latent.unflatten(1, (latents, 3)), rotation_from_6d(rotation), strength.squeeze(1) + STRENGTH_BIAS
+        values = self.transformer(tokens, context).float().flatten(1)[:, : 3 * self.latents + 7]
+        latent, strength, rotation = values.split((3 * self.latents, 1, 6), dim=1)
+        return latent.unflatten(1, (self.latents, 3)), rotation_from_6d(rotation), strength.squeeze(1) + STRENGTH_BIAS

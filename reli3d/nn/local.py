@@ -332,9 +332,9 @@ class LocalField:
 
     def fused(self, position: Tensor, normal: Tensor, visible: Tensor) -> Fused:
         """Blended predictions at surface points: ``position``, ``normal`` ``(N, 3)``, ``visible (N, V)``."""
-        if self.inference:
-            return self._fused_by_kernel(position, normal, visible)
         maps = self.maps
+        if self.inference:  # one kernel, equal to float32 rounding
+            return Fused(*fuse_views(maps.images, self.pixels.packed, maps.camera, position, visible, normal))
         got, _ = gather_views(self.pixels.stacked(), position, maps.camera)
         shown, view_weight, summary = summarize_views(maps.images, maps.camera, position, visible, normal)
         gain, shift, confidence, rough, metal, chroma, fused = got.split([1, 3, 1, 1, 1, 1, 3], -1)
@@ -350,18 +350,13 @@ class LocalField:
         numbers = torch.cat([*mean, fused - normal, facing, summary[:, 5:6], (confidence * weight).sum(1), spread], -1)
         return Fused(logit, numbers, fused)
 
-    def _fused_by_kernel(self, position: Tensor, normal: Tensor, visible: Tensor) -> Fused:
-        """:meth:`fused` by one kernel, equal to float32 rounding; no gradient."""
-        maps = self.maps
-        return Fused(*fuse_views(maps.images, self.pixels.packed, maps.camera, position, visible, normal))
-
     def with_shading(self, position: Tensor, normal: Tensor, visible: Tensor) -> LocalField:
         """The field with :class:`Shading` estimated from some thousand points spread over the surface; no gradient."""
         with torch.no_grad():
-            inputs = self.maps.input_count
+            maps, inputs = self.maps, self.maps.input_count
             visible = torch.cat([visible[:, :inputs], torch.zeros_like(visible[:, inputs:])], 1)
-            color = self._fused_by_kernel(position, normal, visible).logit.sigmoid()
-            _, _, summary = summarize_views(self.maps.images, self.maps.camera, position, visible, normal)
+            color = fuse_views(maps.images, self.pixels.packed, maps.camera, position, visible, normal)[0].sigmoid()
+            _, _, summary = summarize_views(maps.images, maps.camera, position, visible, normal)
             shown, visible_in_any = summary[:, :3], visible.amax(1)
             observed = brightness_over_normal(srgb_to_linear(shown), visible_in_any, normal)
             unlit = unshaded(shown, brightness_at(normal, observed))

@@ -28,12 +28,6 @@ ELEVATION_DEG = (-20.0, 70.0)  # of the camera; not in the paper
 RGB_TENSORS = ("images", "c2w", "intrinsics", "environment")  # of an object without ground-truth material
 
 
-def views_of(light: int, pbr: bool) -> int:
-    """Number of views of an object under its environment of index ``light``."""
-    total = VIEWS_PBR if pbr else VIEWS_RGB
-    return total // LIGHTS + (light < total % LIGHTS)
-
-
 def fields_of_view(u: np.ndarray) -> np.ndarray:
     """Full angles in degrees for uniform ``u``: a normal distribution truncated to FOV_DEG."""
     low, high = FOV_DEG
@@ -81,6 +75,8 @@ def protocol_sample(
     chosen, turns = lights_of(len(maps), maps[0].shape[1], np.random.default_rng((seed, 2)))
     radiance = torch.roll(maps[chosen[light]], int(turns[light]), 1).contiguous()
     rng = np.random.default_rng((seed, 3, light))
-    cameras = framed_cameras(surface.vertices, rng, views_of(light, pbr), size)
+    total = VIEWS_PBR if pbr else VIEWS_RGB
+    count = total // LIGHTS + (light < total % LIGHTS)
+    cameras = framed_cameras(surface.vertices, rng, count, size)
     sample = render_sample(surface, Environment(radiance), cameras, rng)
     return sample if pbr else {name: sample[name] for name in RGB_TENSORS}

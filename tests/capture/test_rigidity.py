@@ -143,7 +143,7 @@ def test_what_moves_around_the_object_is_left_out_of_a_second_map(monkeypatch):
     scene = Scene(np.zeros(3), 3.0, None, on_object, ~on_object)
     regions: list[np.ndarray] = []
 
-    def mapped(photos, progress, masks):
+    def mapped(photos, progress, masks, lenses):
         regions.extend(masks)
         if len(regions) > len(views):
             raise InputError("photographs", "expected images that overlap")

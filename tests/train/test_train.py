@@ -127,14 +127,6 @@ def test_the_excess_entropy_is_least_at_the_target_and_pulls_from_black_and_whit
     torch.testing.assert_close(logit.grad, torch.tensor([-0.5, 0.5]).repeat(3, 1).T / 6, rtol=1e-3, atol=0)
 
 
-def test_turns_are_rotations():
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        turn = random_turn(rng)
-        torch.testing.assert_close(turn @ turn.T, torch.eye(3), rtol=0, atol=1e-6)
-        assert float(torch.linalg.det(turn)) > 0
-
-
 def test_a_batch_is_a_function_of_seed_step_and_places_however_it_is_shared(folder):
     stage = SmallStage(LocalReconstructor(SMALL), [folder], SmallOptions(2, 256), seed=7)
     whole = stage.batch(2, range(4))

@@ -101,7 +101,9 @@ class PaperStage(Stage):
     @torch.no_grad()
     def validation(self, average: dict[str, Tensor]) -> np.ndarray | None:
         """One row per object: reference view, target, rendering, base color, roughness, metallic, normal, lighting."""
-        model = averaged(self.model, average)
+        model = Reconstructor(self.model.preset).to(self.model.device)
+        model.load_state_dict(average)
+        model.eval()
         rows = []
         for one in self.held_out:
             code = encode(model, one)
@@ -126,13 +128,6 @@ def no_surface(where: object) -> InputError:
     fix = f"start from a longer --stage volume ({TINY['volume'].steps} steps by default)"
     problem = f"expected a network that predicts a surface, got none for {CHECKED} training objects"
     return InputError(where, f"{problem}; {fix}, whose log has the fraction with a surface")
-
-
-def averaged(model: Reconstructor, average: dict[str, Tensor]) -> Reconstructor:
-    """A copy of ``model`` with the averaged parameters, in evaluation mode."""
-    other = Reconstructor(model.preset).to(model.device)
-    other.load_state_dict(average)
-    return other.eval()
 
 
 def _tile(values: np.ndarray) -> np.ndarray:
