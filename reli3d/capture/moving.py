@@ -89,7 +89,7 @@ def without_moving(
             return Segmented(second, renewed), again
     fit = f"{100 * report.surroundings_fit:.0f} % of the matches around the object fit the cameras"
     if report.surroundings_fit < LEAST_FIT:
-        report.failed.append(f"{fit}, at least 80 % expected: something moves there")
+        report.failed.append(f"{fit}, at least {100 * LEAST_FIT:.0f} % expected: something moves there")
     else:
         report.notes.append(f"{fit}: if something moves there, the cameras may be inaccurate")
     return segmented, scene

@@ -28,9 +28,7 @@ class CaptureReport:
     gap: float = 0.0  # degrees, the widest between cameras around the object
     agreement: float = 0.0  # median fraction of a mask that the visual hull fills
     epipolar_fit: float = 1.0  # matches on the object that fit the cameras, over those that fit pairs of views
-    surroundings_fit: float = (
-        1.0  # the same of the matches outside the masks; of the first map, if the object was moved
-    )
+    surroundings_fit: float = 1.0  # the same outside the masks; of the first map, if the object was moved
     mask_fraction: float = 0.0  # median fraction of an image that the mask covers
     mask_method: str = ""
     plane: bool = False
