@@ -20,9 +20,9 @@ if [ -n "${DRY_RUN:-}" ]; then
 fi
 
 render() { reli3d-data render "$out/$1" --maps "$maps" "${@:2}"; }
-# train STAGE DATA RUN SHARE BATCH OPTIONS...: a SHARE of the minutes in percent; BATCH objects in each process
+# train STAGE DATA RUN SHARE BATCH OPTIONS...: SHARE of the minutes in percent; BATCH objects, rounded up to the processes
 train() {
-    local time=(--minutes "$(awk "BEGIN { print $minutes * $4 / 100 }")" --batch $(($5 * processes)))
+    local time=(--minutes "$(awk "BEGIN { print $minutes * $4 / 100 }")" --batch $((($5 + processes - 1) / processes * processes)))
     OMP_NUM_THREADS=$((($(nproc) + processes - 1) / processes)) torchrun --nproc-per-node "$processes" -m reli3d.cli.train \
         "$out/$2" "$out/$3" --stage "$1" --device "$device" --bfloat16 "${time[@]}" "${end[@]}" "${@:6}"
 }
@@ -32,8 +32,8 @@ render views --views 5 --size 128 --views-only --count "$views" --meshes "$meshe
 render samples --views 9 --count $((samples / 2))
 render samples --views 9 --first 200000000 --count $((samples / 2)) --meshes "$meshes" --materials "$materials"
 render validation --views 9 "${held_out[@]}"
-train pixels views p64 32 12 --image-size 64 --rate 3e-3
-train pixels views p128 16 10 --image-size 128 --weights "$out/p64/state.pt"
-train small samples run 52 4 --rate 1e-3 --pyramid-rate 0.1 --maps "$maps" --weights "$out/p128/state.pt"
+train pixels views p64 32 24 --image-size 64 --rate 3e-3
+train pixels views p128 16 20 --image-size 128 --weights "$out/p64/state.pt"
+train small samples run 52 8 --rate 1e-3 --pyramid-rate 0.1 --maps "$maps" --weights "$out/p128/state.pt"
 reli3d-train "$out/samples" "$out/run" --validation "$out/validation" --export "$out/small.safetensors"
 [ "$(stat -c %s "$out/small.safetensors")" -lt 16000000 ] || { echo "$out/small.safetensors: above 16 MB" >&2; exit 1; }

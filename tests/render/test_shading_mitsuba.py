@@ -35,8 +35,8 @@ def light(name):
         map_ = torch.full((16, 32, 3), 0.7)
     if name == "sun":
         map_[4, 20] = 400.0
-    # The z-test takes Mitsuba's variance; ours, of fewer light samples, is 2 to 3 times as large where the sun
-    # outshines all else.  At this quarter turn it lights only a part of the scene.
+    # The z-test takes Mitsuba's variance; without the quarter turn, the sun lights most of the scene, and ours is 2.6
+    # (diffuse) and 2.9 times (glossy) as large.
     return Environment(quarter_turn(map_, -1).contiguous())
 
 
