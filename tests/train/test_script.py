@@ -1,28 +1,56 @@
-"""The script that trains the small network from nothing."""
+"""The scripts that pack the training data and train the small network from nothing."""
 
 import os
 import subprocess
+import sys
+import tarfile
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import reli3d
+from reli3d.io.glb import read_glb
 from tests.support.checkout import ROOT
 from tests.support.scenes import ball
 from tests.support.stages import write_maps
 
 
-@pytest.mark.slow
-def test_every_stage_runs_and_the_weights_are_read(tmp_path):
+@pytest.fixture
+def packed(tmp_path):
+    """The archive of one ball, as a mesh and as a shape, of one material set and of six maps."""
     meshes, steel = tmp_path / "meshes", tmp_path / "materials" / "steel"
     meshes.mkdir()
     steel.mkdir(parents=True)
     for name, mode, value in (("basecolor", "RGB", (188, 188, 188)), ("roughness", "L", 51), ("metallic", "L", 255)):
-        Image.new(mode, (64, 64), value).save(steel / f"{name}.png")
+        Image.new(mode, (512, 512), value).save(steel / f"{name}.jpg")
     reli3d.write_glb(meshes / "ball.glb", ball("cpu"))
     maps = write_maps(tmp_path, np.ones((6, 16, 32, 3), np.float32))
-    command = [ROOT / "tools" / "train_small.sh", maps, meshes, steel.parent, tmp_path / "out"]
+    command = [sys.executable, ROOT / "tools" / "pack_training_data.py", tmp_path / "data.tar.xz", "--maps", maps]
+    command += ["--meshes", meshes, "--shapes", meshes, "--materials", steel.parent]
+    subprocess.run(command, check=True, timeout=120)
+    return tmp_path / "data.tar.xz"
+
+
+def test_packed_meshes_have_the_shape_and_materials_of_the_files(packed, tmp_path):
+    with tarfile.open(packed) as archive:
+        archive.extractall(tmp_path / "data", filter="data")
+    (before,), (after,) = (read_glb(folder / "meshes" / "ball.glb") for folder in (tmp_path, tmp_path / "data"))
+    size = float((before.mesh.vertices.amax(0) - before.mesh.vertices.amin(0)).max())
+    rounding = size / 8192  # twice the largest error
+    np.testing.assert_allclose(after.mesh.vertices, before.mesh.vertices, rtol=0, atol=rounding)
+    np.testing.assert_array_equal(after.mesh.faces, before.mesh.faces)
+    for name in ("base_color", "roughness", "metallic"):  # means: JPEG changes texels by a few of 255 levels
+        a, b = (float(getattr(asset.textures, name).mean()) for asset in (after, before))
+        assert abs(a - b) < 2 / 255, name
+    assert Image.open(tmp_path / "data" / "materials" / "steel" / "roughness.jpg").size == (256, 256)
+    shape = tmp_path / "data" / "shapes" / "ball.glb"
+    assert shape.read_bytes() == (tmp_path / "meshes" / "ball.glb").read_bytes()
+
+
+@pytest.mark.slow
+def test_every_stage_runs_and_the_weights_are_read(packed, tmp_path):
+    command = [ROOT / "tools" / "train_small.sh", packed, tmp_path / "out"]
     subprocess.run(command, env={**os.environ, "DRY_RUN": "1", "PROCESSES": "2"}, check=True, timeout=600)
     views = reli3d.load_views(ROOT / "reli3d" / "assets" / "example", views=2)
     options = reli3d.ReconstructOptions(texture_size=256)
