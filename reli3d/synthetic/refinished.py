@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
 from reli3d.errors import InputError
 from reli3d.io.files import file_size
+from reli3d.io.images import read_image
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.gbuffer import sample_texture
 from reli3d.render.points import SurfacePoints
@@ -56,15 +56,13 @@ def _map_file(folder: Path, name: str) -> Path:
 def _read_set(folder: Path, side: int) -> tuple[Tensor, Tensor, Tensor]:
     """Linear base color, (roughness, metallic, 0), tangent-space normal (OpenGL) of a set, each ``(side, side, 3)``."""
 
-    def read(name: str, mode: str, change: Callable[[Tensor], Tensor] = lambda values: values) -> Tensor:
-        with Image.open(_map_file(folder, name)) as image:
-            values = np.atleast_3d(np.array(image.convert(mode), dtype=np.float32) / 255)
-        chw = change(torch.from_numpy(values)).permute(2, 0, 1)[None]
+    def read(name: str, change: Callable[[Tensor], Tensor] = lambda values: values) -> Tensor:
+        chw = change(read_image(_map_file(folder, name))[0]).permute(2, 0, 1)[None]
         return functional.interpolate(chw, (side, side), mode="area")[0].permute(1, 2, 0).contiguous()
 
-    base, rough, metal = read("basecolor", "RGB", srgb_to_linear), read("roughness", "L"), read("metallic", "L")
+    base, rough, metal = read("basecolor", srgb_to_linear), read("roughness")[..., :1], read("metallic")[..., :1]
     if _map_file(folder, "normal").exists():
-        normal = read("normal", "RGB", lambda values: values * 2 - 1)
+        normal = read("normal", lambda values: values * 2 - 1)
     else:
         normal = torch.tensor([0.0, 0.0, 1.0]).expand(side, side, 3).contiguous()
     return base, torch.cat([rough, metal, torch.zeros_like(rough)], -1), functional.normalize(normal, dim=-1)

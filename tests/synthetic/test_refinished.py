@@ -29,11 +29,11 @@ def ball():
 
 @pytest.fixture
 def sets(tmp_path):
-    """One set of a single color, roughness 0.2, metallic 1, flat."""
+    """One set of a single color, roughness 0.2 in 16 bits, metallic 1, flat."""
     folder = tmp_path / "sets" / "steel"
     folder.mkdir(parents=True)
     Image.new("RGB", (64, 64), (188, 188, 188)).save(folder / "basecolor.png")
-    Image.new("L", (64, 64), 51).save(folder / "roughness.png")
+    Image.fromarray(np.full((64, 64), 51 * 257, np.uint16)).save(folder / "roughness.png")
     Image.new("L", (64, 64), 255).save(folder / "metallic.png")
     return material_sets(tmp_path / "sets")
 

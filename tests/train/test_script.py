@@ -22,8 +22,9 @@ def packed(tmp_path):
     meshes, steel = tmp_path / "meshes", tmp_path / "materials" / "steel"
     meshes.mkdir()
     steel.mkdir(parents=True)
-    for name, mode, value in (("basecolor", "RGB", (188, 188, 188)), ("roughness", "L", 51), ("metallic", "L", 255)):
-        Image.new(mode, (512, 512), value).save(steel / f"{name}.jpg")
+    Image.new("RGB", (512, 512), (188, 188, 188)).save(steel / "basecolor.jpg")
+    Image.fromarray(np.full((512, 512), 13137, np.uint16)).save(steel / "roughness.png")
+    Image.new("L", (512, 512), 255).save(steel / "metallic.jpg")
     reli3d.write_glb(meshes / "ball.glb", ball("cpu"))
     maps = write_maps(tmp_path, np.ones((6, 16, 32, 3), np.float32))
     command = [sys.executable, ROOT / "tools" / "pack_training_data.py", tmp_path / "data.tar.xz", "--maps", maps]
@@ -35,16 +36,18 @@ def packed(tmp_path):
 def test_packed_meshes_have_the_shape_and_materials_of_the_files(packed, tmp_path):
     with tarfile.open(packed) as archive:
         archive.extractall(tmp_path / "data", filter="data")
-    (before,), (after,) = (read_glb(folder / "meshes" / "ball.glb") for folder in (tmp_path, tmp_path / "data"))
+    (before,) = read_glb(tmp_path / "meshes" / "ball.glb")
+    (after,) = read_glb(tmp_path / "data" / "meshes" / "0000_ball.glb")
     size = float((before.mesh.vertices.amax(0) - before.mesh.vertices.amin(0)).max())
-    rounding = size / 8192  # twice the largest error
+    rounding = size / 16384  # half a step
     np.testing.assert_allclose(after.mesh.vertices, before.mesh.vertices, rtol=0, atol=rounding)
     np.testing.assert_array_equal(after.mesh.faces, before.mesh.faces)
     for name in ("base_color", "roughness", "metallic"):  # means: JPEG changes texels by a few of 255 levels
         a, b = (float(getattr(asset.textures, name).mean()) for asset in (after, before))
         assert abs(a - b) < 2 / 255, name
-    assert Image.open(tmp_path / "data" / "materials" / "steel" / "roughness.jpg").size == (256, 256)
-    shape = tmp_path / "data" / "shapes" / "ball.glb"
+    roughness = np.asarray(Image.open(tmp_path / "data" / "materials" / "steel" / "roughness.jpg"))
+    np.testing.assert_array_equal(roughness, np.full((256, 256, 3), 51))  # 13137 of 65535
+    shape = tmp_path / "data" / "shapes" / "0000_ball.glb"
     assert shape.read_bytes() == (tmp_path / "meshes" / "ball.glb").read_bytes()
 
 
@@ -54,5 +57,5 @@ def test_every_stage_runs_and_the_weights_are_read(packed, tmp_path):
     subprocess.run(command, env={**os.environ, "DRY_RUN": "1", "PROCESSES": "2"}, check=True, timeout=600)
     views = reli3d.load_views(ROOT / "reli3d" / "assets" / "example", views=2)
     options = reli3d.ReconstructOptions(texture_size=256)
-    asset = reli3d.reconstruct(views, weights=str(tmp_path / "out" / "small.safetensors"), options=options)
+    asset = reli3d.reconstruct(views, weights=str(tmp_path / "out" / "dry_run" / "small.safetensors"), options=options)
     assert len(asset.mesh.faces) > 100
