@@ -5,8 +5,8 @@
 #
 # DATA: archive of pack_training_data.py, or a folder with maps.npz, meshes/, materials/ and, optionally, shapes/.
 # Variables: MINUTES of training (95), VIEWS (3000) and SAMPLES (360) to render, DEVICE (cpu), PROCESSES that divide each
-# batch (cpu: one per core, at most 8; cuda: 1).  DEVICE=cuda first runs the tests that compare CPU and CUDA.
-# DRY_RUN=1: few samples and two steps of each stage, in OUT/dry_run.
+# batch (cpu: one per core, at most 8; cuda: 1).  DEVICE=cuda first runs the tests that compare CPU and CUDA,
+# unless SKIP_TESTS=1.  DRY_RUN=1: few samples and two steps of each stage, in OUT/dry_run.
 set -euo pipefail
 if [ $# != 2 ]; then
     sed -n '2,9s/^# \{0,1\}//p' "$0" >&2
@@ -51,7 +51,9 @@ start() {
     fi
 }
 
-if [ "$device" = cuda ] && [ ! -e "$out/p64" ]; then pytest -q -k cuda "$(dirname "$0")/../tests"; fi
+if [ "$device" = cuda ] && [ ! -e "$out/p64" ] && [ -z "${SKIP_TESTS:-}" ]; then
+    pytest -q -k cuda "$(dirname "$0")/../tests" || { echo "train with SKIP_TESTS=1 if these failures are harmless" >&2; exit 1; }
+fi
 render views --views 5 --size 128 --views-only --count "$views" "${textured[@]}"
 render samples --views 9 --count $((samples / 4))
 render samples --views 9 --first 100000000 --count $((samples / 4)) "${shapes[@]}"
