@@ -15,13 +15,14 @@ from PIL import Image
 
 from reli3d.capture.consistency import masked_views
 from reli3d.capture.mapping import View, map_photos
-from reli3d.capture.masks import is_empty, key_mask, moving_region, touches_border
+from reli3d.capture.masks import is_empty, key_mask, touches_border
 from reli3d.capture.moving import Segmented, object_map, segmented_masks, without_moving
 from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
 from reli3d.capture.report import LEAST_FIT, LEAST_REGISTERED, SMALL_STEPS, CaptureReport, check, summary, widest_gap
-from reli3d.capture.rigidity import Frame, epipolar_fit, inside_mask, on_turntable
+from reli3d.capture.rigidity import Frame, epipolar_fit, inside_mask
 from reli3d.capture.scene import find_scene
 from reli3d.capture.sheet import contact_sheet
+from reli3d.capture.turntable import on_turntable, turntable_positions
 from reli3d.errors import InputError, printable
 from reli3d.io.images import decode_image, unit
 from reli3d.output.folder import check_place, claimed
@@ -73,19 +74,26 @@ def capture(
         options = replace(options, mask_method="alpha")
         notes.append("the alpha of the photographs is used as masks")
     report = CaptureReport(len(photos), notes=notes, mask_method="given" if options.masks else options.mask_method)
-    region = None
+    positions = []
     if options.turntable or options.turntable is None and not cut_out:  # detected by the background
-        region = moving_region([p.pixels for p in photos], fixed=bool(options.turntable))
-    if options.turntable and region is None:
+        positions = turntable_positions([p.pixels for p in photos], fixed=bool(options.turntable))
+    if options.turntable and not positions:
         raise InputError("turntable", "expected images of one size in which the object turns, got others")
     known = _known_masks(photos, options, progress)
-    first = map_photos(photos, progress, None if region is None else [region] * len(photos))
-    if region is not None and not options.turntable and not on_turntable(first.views):
-        region, first = None, map_photos(photos, progress)  # a background without texture hid that the camera moves
-    if region is not None:
-        notes.append("turntable: the camera is fixed and the object turns; the lighting is fixed to the camera")
-    if region is not None or 2 * sum(p.flash for p in photos) > len(photos):
+    regions = {photos[k].name: position.region for position in positions for k in position.images}
+    first = map_photos(photos, progress, [regions[p.name] for p in photos] if positions else None)
+    if positions and not options.turntable:
+        number = {photo.name: k for k, photo in enumerate(photos)}
+        groups = [[v for v in first.views if number[v.photo.name] in position.images] for position in positions]
+        if not all(map(on_turntable, groups)):
+            positions, first = [], map_photos(photos, progress)  # the background has no texture, and the camera moves
+    if positions:
+        places = f"fixed at {len(positions)} positions" if len(positions) > 1 else "fixed"
+        notes.append(f"turntable: the camera is {places}, and the object turns")
+    if 2 * sum(p.flash for p in photos) > len(photos):
         report.lighting = "camera"
+    elif positions:
+        report.lighting = "turntable"
     scene = find_scene(first)
     segmented = Segmented(first, segmented_masks(first, scene, known, progress))
     if len(segmented.masks) < FEWEST:
@@ -97,7 +105,7 @@ def capture(
             + ("give --masks, or take sharper images nearer to it" if enough else SMALL_STEPS),
         )
     report.surroundings_fit = epipolar_fit(first, segmented.masks, inside=False)
-    if region is None:
+    if not positions:
         segmented, scene = without_moving(segmented, scene, known, report, progress)
     final, up, ground = object_map(segmented, scene, known, report, progress)
     report.epipolar_fit, report.surroundings_fit = round(report.epipolar_fit, 3), round(report.surroundings_fit, 3)

@@ -19,10 +19,6 @@ ROUNDS = 3  # of GrabCut
 FEWEST_SEEDS = 6  # keypoints of the object: fewer do not show its colors
 HOLE = 0.002  # of the mask's area: smaller holes and islands are noise
 LEAST_COVERED = 0.0005  # fraction of an image, below which a mask shows no object
-REGION_SIDE = 160  # pixels along the width at which images of a turntable are compared
-STILL = 3.0  # of 255: standard deviation between images up to which a pixel does not change: noise and JPEG
-LEAST_STILL = 0.1  # fraction of such pixels from which the camera is fixed; hand-held images have none
-CLIPPED = 8  # of 255: distance from black and white
 KEY_SIGMAS = 4.0  # standard deviations of the border's color beyond which a pixel is the object
 
 
@@ -147,31 +143,6 @@ def cleaned(mask: np.ndarray, seeds: np.ndarray | None) -> np.ndarray:
     small[0] = False
     mask[small[label]] = 255
     return mask
-
-
-def moving_region(pixels: list[np.ndarray], *, fixed: bool = False) -> np.ndarray | None:
-    """Mask of where images of a fixed camera differ from each other: the turntable with the object; None where the
-    cameras move, or nothing does.
-
-    A camera is fixed where LEAST_STILL of the pixels do not change, or nearly all of the image's border does not.
-    fixed: True where that is known.
-    """
-    if len({p.shape for p in pixels}) != 1:
-        return None
-    size = REGION_SIDE, max(1, round(REGION_SIDE * pixels[0].shape[0] / pixels[0].shape[1]))
-    small = np.stack([cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in pixels]).astype(np.float32)
-    spread = cv2.blur(small.std(0).max(-1), (3, 3))
-    noise = float(np.quantile(spread, 0.05))
-    if float(np.quantile(spread, 0.97)) < max(12.0, 4.0 * noise):
-        return None
-    brightness = small.mean((0, 3))
-    still = (spread < STILL) & (brightness > CLIPPED) & (brightness < 255 - CLIPPED)  # not overexposed sky
-    ring = np.concatenate([spread[:4].ravel(), spread[-4:].ravel(), spread[:, :4].ravel(), spread[:, -4:].ravel()])
-    if not fixed and still.mean() < LEAST_STILL and float(np.quantile(ring, 0.8)) > 5.0:
-        return None
-    moving = (spread > max(6.0, 3.0 * noise)).astype(np.uint8) * 255
-    moving = cleaned(cv2.morphologyEx(moving, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)), None)
-    return cv2.resize(moving, pixels[0].shape[1::-1], interpolation=cv2.INTER_NEAREST)
 
 
 def is_empty(mask: np.ndarray) -> bool:

@@ -32,7 +32,7 @@ class CaptureReport:
     mask_fraction: float = 0.0  # median fraction of an image that the mask covers
     mask_method: str = ""
     plane: bool = False
-    lighting: str = "object"  # frame in which the lighting is fixed: object or camera
+    lighting: str = "object"  # what the lighting is fixed to: object, camera or turntable
     unit: str = "longest side"
     failed: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""Whether a map fits its matches or is that of a turntable, and how an object was moved between two maps."""
+"""Whether a map fits its matches, and how an object was moved between two maps."""
 
 from __future__ import annotations
 
@@ -16,20 +16,7 @@ CONFIDENCE = 0.999  # of RANSAC
 GROUP_TURN = np.cos(np.radians(3.0))  # between rotations of the views of a group
 GROUP_ERROR = 0.02  # of the distance to the middle of the cameras, of positions in a group
 SMALLEST_GROUP = 3  # views
-AXIS_ANGLE = 1.0  # degrees by which the axis of a turntable may differ between the cameras' axes, median
-AXIS_SHIFT = 0.02  # the same of its position, relative to the distance
 LEAST_JOINING = 0.5  # of the matches with views in groups: the motions of groups are less exact than poses
-
-
-def on_turntable(views: Sequence[View]) -> bool:
-    """Whether these are views of a fixed camera: the object turns about an axis that is constant in camera axes."""
-    turns, shifts = np.stack([v.rotation for v in views]), np.stack([v.translation for v in views])
-    u, _, vt = np.linalg.svd(turns.mean(0))  # the direction that the mean rotation shortens least, and its image
-    angles = np.degrees(np.arccos(np.clip(turns @ vt[0] @ u[:, 0], -1, 1)))
-    rows = np.concatenate([turns, np.broadcast_to(-np.eye(3), turns.shape)], 2).reshape(-1, 6)
-    point, at = np.split(np.linalg.lstsq(rows, -shifts.ravel(), rcond=None)[0], 2)  # in the world, in camera axes
-    away = np.linalg.norm(turns @ point + shifts - at, axis=1)
-    return bool(np.median(angles) < AXIS_ANGLE and np.median(away) < AXIS_SHIFT * np.linalg.norm(at))
 
 
 def epipolar_fit(

@@ -77,10 +77,10 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "--light",
-        choices=("object", "camera", "per-group"),
-        help="with --refine: the lighting is fixed to the object, moves with the camera (turntable, flash), or differs "
-        "between sub-folders of images; default: lighting in transforms.json, else object; --light of reli3d-render is "
-        "an environment file instead",
+        choices=("object", "camera", "turntable", "per-group"),
+        help="with --refine: the lighting is fixed to the object, to the camera (flash) or to the room in which the "
+        "object turns about +Y (turntable), or differs between sub-folders of images; default: lighting in "
+        "transforms.json, else object; --light of reli3d-render is an environment file instead",
     )
     p.add_argument("--refine-cameras", action="store_true", help="with --refine: optimize the cameras as well")
     where = p.add_mutually_exclusive_group()

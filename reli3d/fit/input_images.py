@@ -8,13 +8,14 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate, max_pool2d
+from torch.nn.functional import interpolate, max_pool2d, normalize
 
 from reli3d._bridge import check
 from reli3d.geometry.camera import Camera
 from reli3d.render.color import srgb_to_linear
 
 SATURATED_LINEAR = 0.97  # a brighter pixel may be clipped: its value is a lower bound
+LIGHT_AXES = "object", "camera", "turntable"
 INSIDE_COVERAGE = 0.99  # minimum of a pixel and its neighbors that contain only the object
 
 
@@ -40,7 +41,7 @@ class InputImages:
     """``V`` input images of one size on one device.
 
     color: ``(V, S, S, 3)`` linear.  mask: ``(V, S, S)`` coverage in [0, 1].  camera: batch of V cameras.  light_group:
-    index of the lighting per view, by default 0.  light_moves: whether the lighting is fixed to the camera.
+    index of the lighting per view, by default 0.  light_axes: what the lighting is fixed to, of LIGHT_AXES.
     silhouette: ``(V, S, S)``, the mask continued beyond the border of the photograph, by default ``mask``.
     """
 
@@ -48,7 +49,7 @@ class InputImages:
     mask: Tensor
     camera: Camera
     light_group: tuple[int, ...] = ()
-    light_moves: bool = False
+    light_axes: str = "object"
     silhouette: Tensor = None  # type: ignore[assignment] # set after construction
 
     def __post_init__(self):
@@ -61,9 +62,9 @@ class InputImages:
     def of(cls, views: PosedImages, light: str | Sequence[Hashable] = "object") -> InputImages:
         """Converts sRGB images to linear.
 
-        light: ``object``, lighting fixed to the object; ``camera``, lighting fixed to the camera, as on a turntable or
-        with a flash; or a label per view: views with equal labels share their lighting.  Raises TypeError or ValueError
-        if shapes or devices do not match, or for an invalid ``light``.
+        light: one of LIGHT_AXES (``object``; ``camera``, as of a flash; ``turntable``: it turns about +Y as the camera
+        does), or a label per view: views with equal labels share their lighting.  Raises TypeError or ValueError if
+        shapes or devices do not match, or for an invalid ``light``.
         """
         images, masks = views.images, views.masks
         silhouettes = getattr(views, "silhouettes", None)
@@ -83,12 +84,14 @@ class InputImages:
             group = tuple(numbers[g] for g in light)
             if len(group) != count:
                 raise ValueError(f"light: expected the lighting of {count} views, got {len(group)}")
-        elif light not in ("object", "camera"):
-            raise ValueError(f"light: expected object, camera or a name for each view, got {light!r}")
+        elif light not in LIGHT_AXES:
+            raise ValueError(f"light: expected {', '.join(LIGHT_AXES)} or a name for each view, got {light!r}")
         linear = torch.empty_like(images)
         for k, image in enumerate(images.detach()):  # one at a time: less memory
             linear[k] = srgb_to_linear(image)
-        return cls(linear, masks.detach(), camera, group, light == "camera", silhouettes.detach())
+        return cls(
+            linear, masks.detach(), camera, group, light if isinstance(light, str) else "object", silhouettes.detach()
+        )
 
     def __len__(self) -> int:
         return len(self.color)
@@ -102,7 +105,22 @@ class InputImages:
         """The images with these indices, in this order."""
         group = tuple(self.light_group[v] for v in views)
         camera, silhouette = self.camera[views], self.silhouette[views]
-        return InputImages(self.color[views], self.mask[views], camera, group, self.light_moves, silhouette)
+        return InputImages(self.color[views], self.mask[views], camera, group, self.light_axes, silhouette)
+
+    @property
+    def light_turns(self) -> Tensor | None:
+        """Rotations ``(V, 3, 3)`` from the axes to which the lighting is fixed to the object's; None if it is fixed to
+        the object.
+
+        On a turntable the cameras differ by rotations about +Y; their tilt at several heights is not the lighting's.
+        """
+        turns = self.camera.c2w[:, :3, :3]
+        if self.light_axes != "turntable":
+            return turns if self.light_axes == "camera" else None
+        horizontal = turns[:, [0, 2]]  # of the cameras' axes: take that which is the least vertical
+        x, z = normalize(horizontal[..., int(horizontal.norm(dim=1).amin(0).argmax())], dim=-1).unbind(-1)
+        o, one = torch.zeros_like(x), torch.ones_like(x)
+        return torch.stack([x, o, -z, o, one, o, z, o, x], -1).unflatten(-1, (3, 3))
 
     def resized(self, size: int) -> InputImages:
         """The images resampled to ``size`` pixels per side; colors are averaged with the masks as weights."""

@@ -139,15 +139,15 @@ def refine(
     before = view_errors(first, received, near)
     first = with_neutral_light(first, options.light_chromaticity)
     notes: list[str] = []
-    if images.light_moves:
+    if (turns := near.light_turns) is not None:
         notes.append("the lighting moves with the camera; the environment is that of view 0")
     elif len(set(images.light_group)) > 1:
         notes.append(f"{len(set(images.light_group))} lightings; the environment is that of view 0")
     elif light_follows_camera(first.mesh, near):
-        advice = "if the lighting moves with it (turntable, flash), set light to camera"
+        advice = "if the lighting moves with it, set light to camera (flash) or turntable"
         notes.append(f"brightness varies with the camera; {advice}")
     with torch.random.fork_rng(devices=[]):
-        start = Start.of(first, c2w=near.camera.c2w[used] if images.light_moves else None)
+        start = Start.of(first, turns=None if turns is None else turns[used])
         data = FixedSurface(start, first, received, near, used)
         fitted = _fitted(data, options, budget, notes)
         kept, parts, after = chosen(fitted, used, list(held), before)

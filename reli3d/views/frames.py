@@ -41,7 +41,7 @@ class Frame:
     c2w: np.ndarray  # (4, 4) float64, OpenGL axes
     lens: Lens
     notes: tuple[str, ...] = ()  # assumptions about it
-    lighting: str = "object"  # frame in which the lighting is fixed: object or camera
+    lighting: str = "object"  # as in reli3d.fit.input_images: object, camera or turntable
     object_box: tuple[tuple[float, ...], ...] | None = None  # lower and upper corner, of all frames of the file
 
 

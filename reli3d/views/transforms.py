@@ -61,8 +61,9 @@ def read_transforms(path: Path) -> tuple[list[Frame], list[str]]:
         raise InputError(path, f"frames: expected at most {MAX_FRAMES}, got {len(frames)}; keep the views to be used")
     check_keys(str(path), data)
     lighting = data.get("lighting", "object")
-    if lighting not in ("object", "camera"):
-        raise InputError(path, f"lighting: expected object or camera, got {shown(lighting)}; correct the camera file")
+    if lighting not in ("object", "camera", "turntable"):
+        expected = "lighting: expected object, camera or turntable"
+        raise InputError(path, f"{expected}, got {shown(lighting)}; correct the camera file")
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise InputError(path, f"frames[{i}]: expected an object, got {shown(frame)}; export the cameras again")

@@ -58,7 +58,7 @@ class Views(Movable):
     notes: tuple[str, ...] = ()  # changes and assumptions made on reading, one line each
     in_folder: int | None = None  # number of views in the folder
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of this world frame, in the folder's world frame
-    lighting: str = "object"  # frame in which the lighting is fixed: object or camera
+    lighting: str = "object"  # as in reli3d.fit.input_images: object, camera or turntable
     chosen: tuple[int, ...] | None = None  # indices of the views for the network (at most 16) if all were read
     object_box: tuple[tuple[float, ...], ...] | None = None  # lower and upper corner, if the folder has it
 

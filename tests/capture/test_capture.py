@@ -123,10 +123,11 @@ def test_alpha_of_cut_out_photographs_is_used_as_masks(tmp_path):
 
 
 @pytest.mark.slow
-def test_cameras_of_a_turntable(tmp_path):
-    turning = render_capture(views=24, turntable=True)
+@pytest.mark.parametrize("views, elevations", [(24, [30]), (36, [20, 45])])
+def test_cameras_of_a_turntable(tmp_path, views, elevations):
+    turning = render_capture(views=views, turntable=elevations)
     report = capture(turning.write(tmp_path / "photographs"), tmp_path / "object")
-    assert report.registered == 24 and not report.failed and report.lighting == "camera"
+    assert report.registered == views and not report.failed and report.lighting == "turntable"
     check_cameras(turning, tmp_path / "object")
 
 

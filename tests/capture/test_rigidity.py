@@ -12,7 +12,7 @@ from reli3d.capture import capture as function
 from reli3d.capture import moving
 from reli3d.capture.mapping import Map, View
 from reli3d.capture.report import CaptureReport
-from reli3d.capture.rigidity import Group, completed_groups, epipolar_fit, on_turntable, rigid_groups
+from reli3d.capture.rigidity import Group, completed_groups, epipolar_fit, rigid_groups
 from reli3d.capture.scene import Scene
 from reli3d.errors import InputError
 from tests.support.mapped import SIZE, view
@@ -55,20 +55,6 @@ def object_map(moved: bool) -> tuple[Map, dict[str, np.ndarray]]:
         both = np.concatenate([shown, v.project(surroundings)[0]])
         pixels.append(both + rng.normal(0, 0.1, both.shape))
     return map_of(views, all_pairs(pixels)), masks
-
-
-@pytest.mark.parametrize(
-    "tilt, height, fixed", [(0.0, 0.0, True), (0.3, 0.003, True), (3.0, 0.0, False), (0.0, 0.2, False)]
-)
-def test_views_of_a_turntable_have_one_axis_in_camera_axes(tilt, height, fixed):
-    """tilt: degrees by which every second camera is tilted.  height: of every second camera, over the distance."""
-    views = []
-    for k, azimuth in enumerate(2 * np.pi * np.arange(15) / 20):  # three quarters of a turn
-        shown = view(k, 3.0 * np.array([np.cos(azimuth), np.sin(azimuth), 0.5]))
-        tilted = cv2.Rodrigues(np.radians([tilt * (k % 2), 0, 0]))[0]
-        moved = shown.translation + [0, 3.0 * height * (k % 2), 0]
-        views.append(replace(shown, rotation=tilted @ shown.rotation, translation=tilted @ moved))
-    assert on_turntable(views) == fixed
 
 
 @pytest.mark.parametrize("moved", [False, True])

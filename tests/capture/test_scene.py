@@ -1,4 +1,4 @@
-"""Parts of a capture by themselves: support plane, masks by color, turntables, and masks cut off by the border."""
+"""Parts of a capture by themselves: support plane, masks by color, and masks cut off by the border."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from reli3d.capture.masks import cleaned, key_mask, moving_region, touches_border
+from reli3d.capture.masks import cleaned, key_mask, touches_border
 from reli3d.capture.report import widest_gap
 from reli3d.capture.scene import find_plane
+from tests.support.mapped import overlap
 
 
 def test_the_support_plane_is_the_largest_area_and_not_the_most_points():
@@ -32,11 +33,6 @@ def test_the_support_plane_is_the_largest_area_and_not_the_most_points():
     assert find_plane(rng.normal(size=(500, 3)), eyes, 2.2) is None  # a cloud has none
 
 
-def overlap(mask: np.ndarray, expected: np.ndarray) -> float:
-    """Intersection over union."""
-    return ((mask > 127) & (expected > 0)).sum() / ((mask > 127) | (expected > 0)).sum()
-
-
 def test_masks_by_color():
     image = np.full((200, 300, 3), (200, 205, 210), np.uint8)
     cv2.circle(image, (150, 100), 50, (120, 40, 30), -1)
@@ -57,27 +53,6 @@ def test_islands_and_holes_of_a_mask():
     mask[170:190, 170:190] = 255  # one with a seed
     result = cleaned(mask, np.array([[100.0, 60.0], [180.0, 180.0]]))
     assert result[100, 100] == 0 and result[61, 61] == 255 and result[15, 15] == 0 and result[180, 180] == 255
-
-
-def test_a_fixed_camera_and_a_turning_object_are_a_turntable():
-    rng = np.random.default_rng(0)
-    background = cv2.resize(rng.integers(0, 255, (30, 40, 3), dtype=np.uint8), (320, 240))
-    images = []
-    for _ in range(10):
-        image = background.copy()
-        image[80:200, 100:220] = cv2.resize(rng.integers(0, 255, (12, 12, 3), dtype=np.uint8), (120, 120))
-        images.append(image)
-    ground_truth = np.zeros((240, 320), bool)
-    ground_truth[80:200, 100:220] = True
-    assert overlap(moving_region(images), ground_truth) > 0.8  # the region is found at 160 pixels
-    for image in images:  # the table reaches the border on three sides
-        image[150:] = cv2.resize(rng.integers(0, 255, (9, 32, 3), dtype=np.uint8), (320, 90))
-    ground_truth[150:] = True
-    assert overlap(moving_region(images), ground_truth) > 0.8
-    moving = [np.roll(background, 9 * k, 1) for k in range(10)]
-    for image in moving:
-        image[:60] = 255  # an overexposed sky
-    assert moving_region(moving) is None  # a camera that moves
 
 
 def test_a_mask_that_is_cut_off_touches_the_border():

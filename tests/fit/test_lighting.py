@@ -109,9 +109,25 @@ def test_groups_of_views_have_lights_of_their_own():
 
 def test_a_camera_light_is_turned_into_the_frame_of_the_object(moving_views):
     images = InputImages.of(moving_views, "camera")
-    lights = Lights(small_scene.sky().resized(64).radiance[None], images.light_group, images.camera.c2w)
+    lights = Lights(small_scene.sky().resized(64).radiance[None], images.light_group, images.light_turns)
     for k in (0, 3):
         expected = camera_light(k, images.camera.c2w[k, :3, :3]).resized(64).radiance
+        assert float((lights.of_view(k).radiance - expected).abs().mean()) < 0.02  # two bilinear lookups
+
+
+@pytest.mark.parametrize("roll", [0, 90])  # degrees, about the direction of view: of landscape and portrait
+def test_the_light_of_a_turntable_turns_about_y_with_cameras_of_any_height(moving_views, roll):
+    """The object turns under the sky; the camera is first level with it, then looks down."""
+    azimuth, height = torch.tensor([0.0, 1.0, 2.5, 0.3, 4.0, 5.0]), torch.tensor([0.0, 0.0, 0.0, 1.5, 1.5, 1.5])
+    eyes = torch.stack([azimuth.sin(), height, azimuth.cos()], -1)
+    c2w = torch.stack([look_at(2.0 * eye) for eye in eyes])
+    if roll:
+        c2w[:, :3, :2] = torch.stack([c2w[:, :3, 1], -c2w[:, :3, 0]], -1)
+    images = InputImages.of(replace(moving_views, c2w=c2w), "turntable")
+    turns = images.light_turns
+    lights = Lights(small_scene.sky().resized(64).radiance[None], images.light_group, turns[0].T @ turns)
+    for k in range(VIEWS):
+        expected = small_scene.sky().rotated(float(azimuth[k])).resized(64).radiance
         assert float((lights.of_view(k).radiance - expected).abs().mean()) < 0.02  # two bilinear lookups
 
 
@@ -124,7 +140,9 @@ def test_lights_are_evaluated_for_their_own_rows():
 
 
 def test_another_light_is_refused(moving_views):
-    with pytest.raises(ValueError, match="light: expected object, camera or a name for each view, got 'sun'"):
+    with pytest.raises(
+        ValueError, match="light: expected object, camera, turntable or a name for each view, got 'sun'"
+    ):
         InputImages.of(moving_views, "sun")
     with pytest.raises(ValueError, match="light: expected the lighting of 6 views, got 2"):
         InputImages.of(moving_views, [0, 1])
@@ -168,7 +186,7 @@ def test_light_that_moves_with_the_camera_is_reported():
     images = shaded(True)
     views = ViewBatch(linear_to_srgb(images.color), images.mask, images.camera.c2w, images.camera.intrinsics)
     notes = refine(small_scene.ball(), views, steps=1, options=RefineOptions(16)).notes
-    assert any("set light to camera" in note for note in notes)
+    assert any("set light to camera (flash) or turntable" in note for note in notes)
 
 
 def test_the_start_of_a_light_that_moves_with_the_camera_is_in_its_axes():
@@ -178,7 +196,7 @@ def test_the_start_of_a_light_that_moves_with_the_camera_is_in_its_axes():
     c2w = torch.stack([look_at(eye) for eye in eyes])
     light = 0.1 + 5.0 * (lat_long_directions(64)[..., 1:2] > 0.95).float().expand(-1, -1, 3)
     ball = replace(small_scene.ball(), environment=Environment(light.contiguous()))
-    start = Start.of(ball, c2w=c2w).light.exp()[..., 0]
+    start = Start.of(ball, turns=c2w[:, :3, :3]).light.exp()[..., 0]
     weight = (start > 1.0).float() * texel_solid_angles(*start.shape).to(start)[:, None]
     mean = (lat_long_directions(start.shape[0]) * weight[..., None]).sum((0, 1))
     expected = torch.tensor([0.0, 0.5**0.5, 0.5**0.5])

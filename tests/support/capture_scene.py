@@ -83,12 +83,13 @@ def board(azimuth: float, origins, directions, depth) -> tuple[torch.Tensor, tor
 
 
 def render_capture(
-    views: int, *, heights=(24, 46), moved_after=None, turntable=False, passerby=False, plain=False
+    views: int, *, heights=(24, 46), moved_after=None, turntable=(), passerby=False, plain=False
 ) -> TrueCapture:
     """A ring of hand-held views at two heights [degrees] under a sky; cameras are relative to the object.
 
-    moved_after: from this view on the object is elsewhere on the table.  turntable: the camera is fixed, the object
-    turns with a small table in front of a textured background.  passerby: something upright moves behind the table.
+    moved_after: from this view on the object is elsewhere on the table.  turntable: elevations [degrees] of a fixed
+    camera, one after the other; the object turns with a small table in front of a textured background.  passerby:
+    something upright moves behind the table.
     plain: a gray background without texture or shadow.
     """
     rng = np.random.default_rng(0)
@@ -100,7 +101,8 @@ def render_capture(
     distance = 2.9 * rng.uniform(0.92, 1.08, views)
     target, roll = rng.normal(0, 0.03, (views, 3)), rng.normal(0, 0.04, (views, 3))
     if turntable:
-        elevation[:], distance[:], target[:], roll[:] = np.radians(30), 2.9, 0.0, 0.0
+        elevation = np.radians(np.repeat(turntable, views // len(turntable)))
+        azimuth, distance[:], target[:], roll[:] = len(turntable) * azimuth, 2.9, 0.0, 0.0
     horizontal = np.cos(elevation) * distance
     eye = np.stack([horizontal * np.sin(azimuth), np.sin(elevation) * distance, horizontal * np.cos(azimuth)], -1)
     rows = torch.linspace(1.2, 0.5, 32)[:, None, None].expand(32, 64, 3)

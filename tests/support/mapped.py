@@ -17,3 +17,8 @@ def view(k: int, eye: np.ndarray, radial: float = 0.0) -> View:
     photo = Photo(str(k), np.zeros((SIZE[1], SIZE[0], 3), np.uint8), None, ())
     principal = np.array(SIZE) / 2 + (3, -2)
     return View(photo, rotation, -rotation @ eye, 500.0, principal, radial, np.zeros((0, 2)), np.zeros(0, np.int64))
+
+
+def overlap(mask: np.ndarray, expected: np.ndarray) -> float:
+    """Intersection over union."""
+    return ((mask > 127) & (expected > 0)).sum() / ((mask > 127) | (expected > 0)).sum()

@@ -241,5 +241,7 @@ def test_the_lighting_of_a_capture_is_read(tmp_path):
     transforms(tmp_path, frames, lighting="camera")
     assert load_views(tmp_path).lighting == "camera"
     transforms(tmp_path, frames, lighting="turntable")
-    with pytest.raises(InputError, match="lighting: expected object or camera"):
+    assert load_views(tmp_path).lighting == "turntable"
+    transforms(tmp_path, frames, lighting="room")
+    with pytest.raises(InputError, match="lighting: expected object, camera or turntable, got 'room'"):
         load_views(tmp_path)
