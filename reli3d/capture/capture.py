@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from reli3d.capture.consistency import masked_views
-from reli3d.capture.mapping import View, map_photos
+from reli3d.capture.mapping import Map, View, map_photos
 from reli3d.capture.masks import is_empty, key_mask, touches_border
 from reli3d.capture.moving import Segmented, object_map, segmented_masks, without_moving
 from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
@@ -22,7 +22,7 @@ from reli3d.capture.report import LEAST_FIT, LEAST_REGISTERED, SMALL_STEPS, Capt
 from reli3d.capture.rigidity import Frame, epipolar_fit, inside_mask
 from reli3d.capture.scene import find_scene
 from reli3d.capture.sheet import contact_sheet
-from reli3d.capture.turntable import on_turntable, turntable_positions
+from reli3d.capture.turntable import on_turntable, turns, turntable_positions
 from reli3d.errors import InputError, printable
 from reli3d.io.images import decode_image, unit
 from reli3d.output.folder import check_place, claimed
@@ -74,26 +74,12 @@ def capture(
         options = replace(options, mask_method="alpha")
         notes.append("the alpha of the photographs is used as masks")
     report = CaptureReport(len(photos), notes=notes, mask_method="given" if options.masks else options.mask_method)
-    positions = []
-    if options.turntable or options.turntable is None and not cut_out:  # detected by the background
-        positions = turntable_positions([p.pixels for p in photos], fixed=bool(options.turntable))
-    if options.turntable and not positions:
-        raise InputError("turntable", "expected images of one size in which the object turns, got others")
     known = _known_masks(photos, options, progress)
-    regions = {photos[k].name: position.region for position in positions for k in position.images}
-    first = map_photos(photos, progress, [regions[p.name] for p in photos] if positions else None)
-    if positions and not options.turntable:
-        number = {photo.name: k for k, photo in enumerate(photos)}
-        groups = [[v for v in first.views if number[v.photo.name] in position.images] for position in positions]
-        if not all(map(on_turntable, groups)):
-            positions, first = [], map_photos(photos, progress)  # the background has no texture, and the camera moves
-    if positions:
-        places = f"fixed at {len(positions)} positions" if len(positions) > 1 else "fixed"
-        notes.append(f"turntable: the camera is {places}, and the object turns")
+    detected = options.turntable is None and not cut_out  # by the background
+    turning = _map_on_turntable(source, photos, report, options, progress) if options.turntable or detected else None
+    first = turning or map_photos(photos, progress)
     if 2 * sum(p.flash for p in photos) > len(photos):
         report.lighting = "camera"
-    elif positions:
-        report.lighting = "turntable"
     scene = find_scene(first)
     segmented = Segmented(first, segmented_masks(first, scene, known, progress))
     if len(segmented.masks) < FEWEST:
@@ -105,7 +91,7 @@ def capture(
             + ("give --masks, or take sharper images nearer to it" if enough else SMALL_STEPS),
         )
     report.surroundings_fit = epipolar_fit(first, segmented.masks, inside=False)
-    if not positions:
+    if turning is None:
         segmented, scene = without_moving(segmented, scene, known, report, progress)
     final, up, ground = object_map(segmented, scene, known, report, progress)
     report.epipolar_fit, report.surroundings_fit = round(report.epipolar_fit, 3), round(report.surroundings_fit, 3)
@@ -153,6 +139,32 @@ def _check_output(source: Path, output: Path, masks: Path | None) -> None:
         raise InputError(masks, "expected masks outside the output, which is replaced; copy them to another folder")
     if output.is_dir() and any(output.iterdir()) and not (output / "capture.json").exists():
         raise InputError(output, "expected an empty folder or an earlier capture, got other files; give another")
+
+
+def _map_on_turntable(
+    source: Path, photos: Sequence[Photo], report: CaptureReport, options: CaptureOptions, progress: Progress
+) -> Map | None:
+    """The map of what turns before a fixed camera, with ``report.lighting``; None where the camera moves."""
+    positions = turntable_positions([p.pixels for p in photos], fixed=bool(options.turntable))
+    if not positions:
+        if options.turntable:
+            raise InputError("turntable", "expected images of one size in which the object turns, got others")
+        return None
+    position = {photos[k].name: n for n, group in enumerate(positions) for k in group.images}
+    found = map_photos(photos, progress, [positions[position[p.name]].region for p in photos])
+    groups = [[v for v in found.views if position[v.photo.name] == n] for n in range(len(positions))]
+    if len(found.views) >= LEAST_REGISTERED * len(photos) and not any(map(turns, groups)):
+        raise InputError(
+            source,
+            "expected an object that turns together with what it stands on, or a camera that moves around it, got a "
+            "fixed camera and features that do not turn; use a turntable with texture, or walk around the object",
+        )
+    if not options.turntable and not all(map(on_turntable, groups)):
+        return None  # the camera moves before a background without texture
+    places = f" at {len(positions)} positions" if len(positions) > 1 else ""
+    report.notes.append(f"turntable: the camera is fixed{places}, and the object turns")
+    report.lighting = "turntable" if len(positions) > 1 else "camera"
+    return found
 
 
 def _known_masks(photos: Sequence[Photo], options: CaptureOptions, progress: Progress) -> dict[str, np.ndarray] | None:

@@ -1,4 +1,4 @@
-"""Turntables: an object that turns in front of a camera that is fixed, or fixed at several positions in turn."""
+"""Objects that turn, alone or on a turntable, before a camera that is fixed at one position or at several in turn."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ LEAST_STILL = 0.1  # fraction of such pixels from which the camera is fixed; han
 SAME_POSITION = 0.5  # of the largest fraction between two images: the least between images of one position
 BORDER_STILL = 5.0  # of 255: the same deviation, of four fifths of the border's pixels
 CLIPPED = 8  # of 255: distance from black and white
+LEAST_TURN = 45.0  # degrees between two views of an object that turns
 AXIS_ANGLE = 1.0  # degrees by which the axis of a turntable may differ between the cameras' axes, median
 AXIS_SHIFT = 0.02  # the same of its position, relative to the distance
 
@@ -40,9 +41,7 @@ def turntable_positions(pixels: Sequence[np.ndarray], *, fixed: bool = False) ->
     """
     if len({p.shape for p in pixels}) != 1:
         return []
-    shape = pixels[0].shape[:2]
-    size = REGION_SIDE, max(1, round(REGION_SIDE * shape[0] / shape[1]))
-    small = np.stack([cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in pixels]).astype(np.float32)
+    small, shape = _small(pixels), pixels[0].shape[:2]
     every = [tuple(range(len(small)))]
     for groups, known in ((every, False), (_similar_images(small), False), (every, fixed)):
         found = []
@@ -53,6 +52,12 @@ def turntable_positions(pixels: Sequence[np.ndarray], *, fixed: bool = False) ->
         if len(found) == len(groups):
             return found
     return []
+
+
+def _small(pixels: Sequence[np.ndarray]) -> np.ndarray:
+    """Images of one size ``(N, h, REGION_SIDE, 3)`` float32."""
+    size = REGION_SIDE, max(1, round(REGION_SIDE * pixels[0].shape[0] / pixels[0].shape[1]))
+    return np.stack([cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in pixels]).astype(np.float32)
 
 
 def _similar_images(images: np.ndarray) -> list[tuple[int, ...]]:
@@ -85,17 +90,24 @@ def _moving_region(images: np.ndarray, *, fixed: bool) -> np.ndarray | None:
     return cleaned(cv2.morphologyEx(moving, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)), None)
 
 
+def turns(views: Sequence[View]) -> bool:
+    """Whether two views differ by a rotation of LEAST_TURN or more."""
+    rotations = np.array([v.rotation for v in views]).reshape(-1, 3, 3)
+    cosines = (np.einsum("iab,jab->ij", rotations, rotations) - 1) / 2
+    return bool((cosines <= np.cos(np.radians(LEAST_TURN))).any())
+
+
 def on_turntable(views: Sequence[View]) -> bool:
     """Whether these are views of a fixed camera: the object turns about an axis that is constant in camera axes.
 
-    False for fewer than 3 views, which any axis fits.
+    False for views that do not turn, and for fewer than 3, which any axis fits.
     """
-    if len(views) < 3:
+    if len(views) < 3 or not turns(views):
         return False
-    turns, shifts = np.stack([v.rotation for v in views]), np.stack([v.translation for v in views])
-    u, _, vt = np.linalg.svd(turns.mean(0))  # the direction that the mean rotation shortens least, and its image
-    angles = np.degrees(np.arccos(np.clip(turns @ vt[0] @ u[:, 0], -1, 1)))
-    rows = np.concatenate([turns, np.broadcast_to(-np.eye(3), turns.shape)], 2).reshape(-1, 6)
+    rotations, shifts = np.stack([v.rotation for v in views]), np.stack([v.translation for v in views])
+    u, _, vt = np.linalg.svd(rotations.mean(0))  # the direction that the mean rotation shortens least, and its image
+    angles = np.degrees(np.arccos(np.clip(rotations @ vt[0] @ u[:, 0], -1, 1)))
+    rows = np.concatenate([rotations, np.broadcast_to(-np.eye(3), rotations.shape)], 2).reshape(-1, 6)
     point, at = np.split(np.linalg.lstsq(rows, -shifts.ravel(), rcond=None)[0], 2)  # in the world, in camera axes
-    away = np.linalg.norm(turns @ point + shifts - at, axis=1)
+    away = np.linalg.norm(rotations @ point + shifts - at, axis=1)
     return bool(np.median(angles) < AXIS_ANGLE and np.median(away) < AXIS_SHIFT * np.linalg.norm(at))

@@ -123,11 +123,11 @@ def test_alpha_of_cut_out_photographs_is_used_as_masks(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("views, elevations", [(24, [30]), (36, [20, 45])])
-def test_cameras_of_a_turntable(tmp_path, views, elevations):
+@pytest.mark.parametrize("views, elevations, lighting", [(24, [30], "camera"), (36, [20, 45], "turntable")])
+def test_cameras_of_a_turntable(tmp_path, views, elevations, lighting):
     turning = render_capture(views=views, turntable=elevations)
     report = capture(turning.write(tmp_path / "photographs"), tmp_path / "object")
-    assert report.registered == views and not report.failed and report.lighting == "turntable"
+    assert report.registered == views and not report.failed and report.lighting == lighting
     check_cameras(turning, tmp_path / "object")
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reli3d.capture.turntable import on_turntable, turntable_positions
+from reli3d.capture.turntable import on_turntable, turns, turntable_positions
 from tests.support.mapped import overlap, view
 
 SIZE = 320, 240
@@ -76,4 +76,5 @@ def test_views_of_a_turntable_have_one_axis_in_camera_axes(tilt, height, fixed):
         moved = shown.translation + [0, 3.0 * height * (k % 2), 0]
         views.append(replace(shown, rotation=tilted @ shown.rotation, translation=tilted @ moved))
     assert on_turntable(views) == fixed
-    assert not on_turntable(views[:2])
+    assert turns(views) and not turns([views[0]] * 15)
+    assert not on_turntable(views[:2]) and not on_turntable([views[0]] * 15)  # a camera that is fixed to the object
