@@ -35,15 +35,15 @@ class Position:
 def turntable_positions(pixels: Sequence[np.ndarray], *, fixed: bool = False) -> list[Position]:
     """The positions of the camera, if all images of each agree but for the turntable with the object; else none.
 
-    A camera is fixed where LEAST_STILL of the pixels do not change, or nearly all of the image's border does not.  If
-    it is not over all images, these are grouped by pairs in which at least SAME_POSITION as many pixels agree as in the
-    most similar pair; each position has at least FEWEST images.  fixed: True where that is known.
+    Images have one position if they are linked by pairs in which at least SAME_POSITION as many pixels agree as in the
+    most similar pair; each position has at least FEWEST images.  A camera is fixed where LEAST_STILL of the pixels do
+    not change, or nearly all of the image's border does not.  fixed: True where that is known.
     """
     if len({p.shape for p in pixels}) != 1:
         return []
     small, shape = _small(pixels), pixels[0].shape[:2]
     every = [tuple(range(len(small)))]
-    for groups, known in ((every, False), (_similar_images(small), False), (every, fixed)):
+    for groups, known in ((_similar_images(small), False), (every, False), (every, fixed)):
         found = []
         for group in groups:
             region = _moving_region(small[list(group)], fixed=known) if len(group) >= FEWEST else None
