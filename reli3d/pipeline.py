@@ -432,7 +432,7 @@ class FolderOptions:
 
     views, masks, remove_background: as in :func:`~reli3d.views.folder.load_views`.  budget: ``seconds`` or ``steps`` of
     a refinement on all images that show the whole object; empty: none.  cameras: also optimize the cameras.
-    interrupt: as in :func:`reli3d.fit.refine.refine`.  light: as of ``InputImages.of``, or ``per-group`` (one
+    interrupt: as in :func:`reli3d.fit.refine.refine`.  light: as in ``InputImages.of``, or ``per-group`` (one
     lighting per sub-folder of images); None: read from the folder.
     """
 

@@ -16,13 +16,13 @@ from PIL import Image
 from reli3d.capture.consistency import masked_views
 from reli3d.capture.mapping import Map, View, map_photos
 from reli3d.capture.masks import is_empty, key_mask, touches_border
-from reli3d.capture.moving import Segmented, object_map, segmented_masks, without_moving
+from reli3d.capture.moving import Segmented, map_if_any, object_map, segmented_masks, without_moving
 from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
 from reli3d.capture.report import LEAST_FIT, LEAST_REGISTERED, SMALL_STEPS, CaptureReport, check, summary, widest_gap
-from reli3d.capture.rigidity import Frame, epipolar_fit, inside_mask
+from reli3d.capture.rigidity import SMALLEST_GROUP, Frame, epipolar_fit, inside_mask
 from reli3d.capture.scene import find_scene
 from reli3d.capture.sheet import contact_sheet
-from reli3d.capture.turntable import on_turntable, turns, turntable_positions
+from reli3d.capture.turntable import Position, on_turntable, rotates, turntable_positions
 from reli3d.errors import InputError, printable
 from reli3d.io.images import decode_image, unit
 from reli3d.output.folder import check_place, claimed
@@ -42,7 +42,8 @@ OUTLIER_AGREEMENT = 0.8  # of the median: a view whose mask the hull fills less 
 @dataclass(frozen=True)
 class CaptureOptions:
     """masks: folder of masks with the images' names, instead of a method.  turntable: the object turns in front of a
-    fixed camera; None detects it.  size: longest side of the object in millimeters, for an object folder in meters.
+    camera that is fixed at one or several heights; None detects it.  size: longest side of the object in millimeters,
+    for an object folder in meters.
     """
 
     masks: Path | None = None
@@ -74,9 +75,9 @@ def capture(
         options = replace(options, mask_method="alpha")
         notes.append("the alpha of the photographs is used as masks")
     report = CaptureReport(len(photos), notes=notes, mask_method="given" if options.masks else options.mask_method)
+    positions = _positions(photos, options, cut_out)
     known = _known_masks(photos, options, progress)
-    detected = options.turntable is None and not cut_out  # by the background
-    turning = _map_on_turntable(source, photos, report, options, progress) if options.turntable or detected else None
+    turning = _map_on_turntable(source, photos, positions, options, report, progress) if positions else None
     first = turning or map_photos(photos, progress)
     if 2 * sum(p.flash for p in photos) > len(photos):
         report.lighting = "camera"
@@ -141,29 +142,43 @@ def _check_output(source: Path, output: Path, masks: Path | None) -> None:
         raise InputError(output, "expected an empty folder or an earlier capture, got other files; give another")
 
 
-def _map_on_turntable(
-    source: Path, photos: Sequence[Photo], report: CaptureReport, options: CaptureOptions, progress: Progress
-) -> Map | None:
-    """The map of what turns before a fixed camera, with ``report.lighting``; None where the camera moves."""
+def _positions(photos: Sequence[Photo], options: CaptureOptions, cut_out: bool) -> list[Position]:
+    """Of a camera in front of a turntable, by the background; none where the camera moves."""
+    if options.turntable is False or cut_out and not options.turntable:
+        return []
     positions = turntable_positions([p.pixels for p in photos], fixed=bool(options.turntable))
-    if not positions:
-        if options.turntable:
-            raise InputError("turntable", "expected images of one size in which the object turns, got others")
-        return None
+    if options.turntable and not positions:
+        raise InputError("turntable", "expected images of one size in which the object turns, got others")
+    return positions
+
+
+def _map_on_turntable(
+    source: Path,
+    photos: Sequence[Photo],
+    positions: Sequence[Position],
+    options: CaptureOptions,
+    report: CaptureReport,
+    progress: Progress,
+) -> Map | None:
+    """The map of what turns, and in ``report`` the lighting; None where the views are not those of a turntable."""
     position = {photos[k].name: n for n, group in enumerate(positions) for k in group.images}
-    found = map_photos(photos, progress, [positions[position[p.name]].region for p in photos])
-    groups = [[v for v in found.views if position[v.photo.name] == n] for n in range(len(positions))]
-    if len(found.views) >= LEAST_REGISTERED * len(photos) and not any(map(turns, groups)):
+    regions = [positions[position[p.name]].region for p in photos]
+    found = (map_photos if options.turntable else map_if_any)(photos, progress, regions)
+    views = found.views if found else ()
+    groups = [[v for v in views if position[v.photo.name] == n] for n in range(len(positions))]
+    groups = [group for group in groups if len(group) >= SMALLEST_GROUP]
+    if len(views) >= LEAST_REGISTERED * len(photos) and not any(map(rotates, groups)):
         raise InputError(
             source,
             "expected an object that turns together with what it stands on, or a camera that moves around it, got a "
             "fixed camera and features that do not turn; use a turntable with texture, or walk around the object",
         )
-    if not options.turntable and not all(map(on_turntable, groups)):
-        return None  # the camera moves before a background without texture
-    places = f" at {len(positions)} positions" if len(positions) > 1 else ""
+    turning = [on_turntable(group) for group in groups]
+    if not options.turntable and not (groups and all(turning)):
+        return None
+    places = f" at {len(groups)} positions" if len(groups) > 1 else ""
     report.notes.append(f"turntable: the camera is fixed{places}, and the object turns")
-    report.lighting = "turntable" if len(positions) > 1 else "camera"
+    report.lighting = "camera" if turning == [True] else "turntable"
     return found
 
 

@@ -76,7 +76,7 @@ def without_moving(
     support = first.points[scene.support]
     regions = [point_mask(*v.project(support), v.photo.size[::-1]) for v in first.views]
     regions = [np.maximum(r, masks.get(v.photo.name, 0)) for r, v in zip(regions, first.views, strict=True)]
-    second = _mapped([v.photo for v in first.views], progress, regions)
+    second = map_if_any([v.photo for v in first.views], progress, regions)
     if second and len(second.views) >= KEPT_FRACTION * len(first.views) and epipolar_fit(second, masks) >= RIGID_FIT:
         again = find_scene(second)
         renewed = segmented_masks(second, again, known, progress)
@@ -95,8 +95,8 @@ def without_moving(
     return segmented, scene
 
 
-def _mapped(
-    photos: list[Photo], progress: Progress, regions: list[np.ndarray], lenses: Map | None = None
+def map_if_any(
+    photos: Sequence[Photo], progress: Progress, regions: list[np.ndarray], lenses: Map | None = None
 ) -> Map | None:
     """:func:`map_photos`, or None where it finds no map."""
     with suppress(InputError):
@@ -164,7 +164,7 @@ def _map_of_moved_object(
     first, views, masks = segmented.found, segmented.views, segmented.masks
     by_name = {v.photo.name: v for v in first.views}
     lenses = first if report.surroundings_fit >= RIGID_FIT else None
-    second = _mapped([v.photo for v in views], progress, [masks[v.photo.name] for v in views], lenses)
+    second = map_if_any([v.photo for v in views], progress, [masks[v.photo.name] for v in views], lenses)
     if second is None:
         return None
     groups, after = rigid_groups(first, second), 1.0

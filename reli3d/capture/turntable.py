@@ -1,4 +1,4 @@
-"""Objects that turn, alone or on a turntable, before a camera that is fixed at one position or at several in turn."""
+"""Turntables: an object that turns in front of a camera that is fixed at one position, or at several in turn."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from scipy.sparse.csgraph import connected_components
 from reli3d.capture.mapping import View
 from reli3d.capture.masks import cleaned
 from reli3d.capture.photos import FEWEST
+from reli3d.capture.rigidity import SMALLEST_GROUP
 
 REGION_SIDE = 160  # pixels along the width at which images are compared
 STILL = 3.0  # of 255: standard deviation between images up to which a pixel does not change: noise and JPEG
 LEAST_STILL = 0.1  # fraction of such pixels from which the camera is fixed; hand-held images have none
-SAME_POSITION = 0.5  # of the largest fraction between two images: the least between images of one position
-BORDER_STILL = 5.0  # of 255: the same deviation, of four fifths of the border's pixels
+SAME_POSITION = 0.5  # of the most similar pair's fraction of such pixels: a pair that has less is of two positions
+BORDER_STILL = 5.0  # of 255: standard deviation between images, of four fifths of the border's pixels
 CLIPPED = 8  # of 255: distance from black and white
-LEAST_TURN = 45.0  # degrees between two views of an object that turns
+LEAST_ROTATION = 5.0  # degrees between two views of an object that turns
 AXIS_ANGLE = 1.0  # degrees by which the axis of a turntable may differ between the cameras' axes, median
 AXIS_SHIFT = 0.02  # the same of its position, relative to the distance
 
@@ -33,20 +34,21 @@ class Position:
 
 
 def turntable_positions(pixels: Sequence[np.ndarray], *, fixed: bool = False) -> list[Position]:
-    """The positions of the camera, if all images of each agree but for the turntable with the object; else none.
+    """The positions of the camera, if all images of each agree except at the turntable with the object; else none.
 
     Images have one position if they are linked by pairs in which at least SAME_POSITION as many pixels agree as in the
     most similar pair; each position has at least FEWEST images.  A camera is fixed where LEAST_STILL of the pixels do
-    not change, or nearly all of the image's border does not.  fixed: True where that is known.
+    not change, or nearly all of the image's border does not.  fixed: True where that is known; a position then has at
+    least SMALLEST_GROUP images.
     """
     if len({p.shape for p in pixels}) != 1:
         return []
-    small, shape = _small(pixels), pixels[0].shape[:2]
+    small, shape, least = _small(pixels), pixels[0].shape[:2], SMALLEST_GROUP if fixed else FEWEST
     every = [tuple(range(len(small)))]
-    for groups, known in ((_similar_images(small), False), (every, False), (every, fixed)):
+    for groups, known in ((_similar_images(small), False), (every, False), (every, True))[: 3 if fixed else 2]:
         found = []
         for group in groups:
-            region = _moving_region(small[list(group)], fixed=known) if len(group) >= FEWEST else None
+            region = _moving_region(small[list(group)], fixed=known) if len(group) >= least else None
             if region is not None:
                 found.append(Position(group, cv2.resize(region, shape[::-1], interpolation=cv2.INTER_NEAREST)))
         if len(found) == len(groups):
@@ -90,19 +92,19 @@ def _moving_region(images: np.ndarray, *, fixed: bool) -> np.ndarray | None:
     return cleaned(cv2.morphologyEx(moving, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)), None)
 
 
-def turns(views: Sequence[View]) -> bool:
-    """Whether two views differ by a rotation of LEAST_TURN or more."""
+def rotates(views: Sequence[View]) -> bool:
+    """Whether two views differ by a rotation of LEAST_ROTATION or more."""
     rotations = np.array([v.rotation for v in views]).reshape(-1, 3, 3)
     cosines = (np.einsum("iab,jab->ij", rotations, rotations) - 1) / 2
-    return bool((cosines <= np.cos(np.radians(LEAST_TURN))).any())
+    return bool((cosines <= np.cos(np.radians(LEAST_ROTATION))).any())
 
 
 def on_turntable(views: Sequence[View]) -> bool:
     """Whether these are views of a fixed camera: the object turns about an axis that is constant in camera axes.
 
-    False for views that do not turn, and for fewer than 3, which any axis fits.
+    False without a rotation, and for fewer than SMALLEST_GROUP, which any axis fits.
     """
-    if len(views) < 3 or not turns(views):
+    if len(views) < SMALLEST_GROUP or not rotates(views):
         return False
     rotations, shifts = np.stack([v.rotation for v in views]), np.stack([v.translation for v in views])
     u, _, vt = np.linalg.svd(rotations.mean(0))  # the direction that the mean rotation shortens least, and its image

@@ -34,7 +34,7 @@ def parser() -> Parser:
     p.add_argument(
         "--turntable",
         action=argparse.BooleanOptionalAction,
-        help="the object rotates in front of a fixed camera (default: detected)",
+        help="the object rotates in front of a camera that is fixed at one or several heights (default: detected)",
     )
     p.add_argument(
         "--size", type=float, metavar="MM", help="longest side of the object in millimeters; units become meters"

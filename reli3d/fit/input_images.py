@@ -15,7 +15,7 @@ from reli3d.geometry.camera import Camera
 from reli3d.render.color import srgb_to_linear
 
 SATURATED_LINEAR = 0.97  # a brighter pixel may be clipped: its value is a lower bound
-LIGHT_AXES = "object", "camera", "turntable"
+LIGHT_FRAMES = "object", "camera", "turntable"
 INSIDE_COVERAGE = 0.99  # minimum of a pixel and its neighbors that contain only the object
 
 
@@ -41,7 +41,7 @@ class InputImages:
     """``V`` input images of one size on one device.
 
     color: ``(V, S, S, 3)`` linear.  mask: ``(V, S, S)`` coverage in [0, 1].  camera: batch of V cameras.  light_group:
-    index of the lighting per view, by default 0.  light_axes: what the lighting is fixed to, of LIGHT_AXES.
+    index of the lighting per view, by default 0.  light_frame: what the lighting is fixed to, of LIGHT_FRAMES.
     silhouette: ``(V, S, S)``, the mask continued beyond the border of the photograph, by default ``mask``.
     """
 
@@ -49,7 +49,7 @@ class InputImages:
     mask: Tensor
     camera: Camera
     light_group: tuple[int, ...] = ()
-    light_axes: str = "object"
+    light_frame: str = "object"
     silhouette: Tensor = None  # type: ignore[assignment] # set after construction
 
     def __post_init__(self):
@@ -62,9 +62,10 @@ class InputImages:
     def of(cls, views: PosedImages, light: str | Sequence[Hashable] = "object") -> InputImages:
         """Converts sRGB images to linear.
 
-        light: one of LIGHT_AXES (``object``; ``camera``, as of a flash; ``turntable``: it turns about +Y as the camera
-        does), or a label per view: views with equal labels share their lighting.  Raises TypeError or ValueError if
-        shapes or devices do not match, or for an invalid ``light``.
+        light: what it is fixed to: ``object``; ``camera``, such as a flash; ``turntable``, the room in which the object
+        turns about +Y in front of a camera that is not moved sideways; or a label per view: views with equal labels
+        share their lighting.  Raises TypeError or ValueError if shapes or devices do not match, or for an invalid
+        ``light``.
         """
         images, masks = views.images, views.masks
         silhouettes = getattr(views, "silhouettes", None)
@@ -84,8 +85,8 @@ class InputImages:
             group = tuple(numbers[g] for g in light)
             if len(group) != count:
                 raise ValueError(f"light: expected the lighting of {count} views, got {len(group)}")
-        elif light not in LIGHT_AXES:
-            raise ValueError(f"light: expected {', '.join(LIGHT_AXES)} or a name for each view, got {light!r}")
+        elif light not in LIGHT_FRAMES:
+            raise ValueError(f"light: expected {', '.join(LIGHT_FRAMES)} or a name for each view, got {light!r}")
         linear = torch.empty_like(images)
         for k, image in enumerate(images.detach()):  # one at a time: less memory
             linear[k] = srgb_to_linear(image)
@@ -105,22 +106,20 @@ class InputImages:
         """The images with these indices, in this order."""
         group = tuple(self.light_group[v] for v in views)
         camera, silhouette = self.camera[views], self.silhouette[views]
-        return InputImages(self.color[views], self.mask[views], camera, group, self.light_axes, silhouette)
+        return InputImages(self.color[views], self.mask[views], camera, group, self.light_frame, silhouette)
 
     @property
-    def light_turns(self) -> Tensor | None:
-        """Rotations ``(V, 3, 3)`` from the axes to which the lighting is fixed to the object's; None if it is fixed to
-        the object.
+    def light_rotations(self) -> Tensor | None:
+        """Rotations ``(V, 3, 3)`` from the axes of the lighting to the object's; None if they are the same.
 
-        On a turntable the cameras differ by rotations about +Y; their tilt at several heights is not the lighting's.
+        ``turntable``: by the azimuth of the direction of view; elevation and roll of the cameras do not count.
         """
-        turns = self.camera.c2w[:, :3, :3]
-        if self.light_axes != "turntable":
-            return turns if self.light_axes == "camera" else None
-        horizontal = turns[:, [0, 2]]  # of the cameras' axes: take that which is the least vertical
-        x, z = normalize(horizontal[..., int(horizontal.norm(dim=1).amin(0).argmax())], dim=-1).unbind(-1)
-        o, one = torch.zeros_like(x), torch.ones_like(x)
-        return torch.stack([x, o, -z, o, one, o, z, o, x], -1).unflatten(-1, (3, 3))
+        rotations = self.camera.c2w[:, :3, :3]
+        if self.light_frame != "turntable":
+            return rotations if self.light_frame == "camera" else None
+        sin, cos = normalize(rotations[:, [0, 2], 2], dim=-1).unbind(-1)
+        zero, one = torch.zeros_like(sin), torch.ones_like(sin)
+        return torch.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos], -1).unflatten(-1, (3, 3))
 
     def resized(self, size: int) -> InputImages:
         """The images resampled to ``size`` pixels per side; colors are averaged with the masks as weights."""

@@ -23,28 +23,28 @@ DIFFUSE_MODEL = "published"  # glTF's formula: that of viewers and of the shippe
 class Lights:
     """Environments of V views.
 
-    maps: ``(G, H, 2H, 3)`` radiance of G groups.  group: map index of each of the V views.  turns: rotations ``(V, 3,
+    maps: ``(G, H, 2H, 3)`` radiance of G groups.  group: map index of each of the V views.  rotations: ``(V, 3,
     3)`` from the maps' axes to the object's; None if they are the same.
     """
 
     maps: Tensor
     group: Sequence[int]
-    turns: Tensor | None = None
+    rotations: Tensor | None = None
 
     @classmethod
     def of(cls, unknowns: Unknowns, start: Start, images: InputImages) -> Lights:
         """The fitted lights of ``images``.  Gradients reach ``unknowns.light``."""
         maps = (start.light + light_maps(unknowns.light)).exp()
-        return cls(maps, images.light_group, images.light_turns)
+        return cls(maps, images.light_group, images.light_rotations)
 
     def of_view(self, view: int) -> Environment:
         """The environment of a view in the object's frame.  Gradients reach ``maps``."""
         light = Environment(self.maps[self.group[view]].contiguous())
-        if self.turns is None:
+        if self.rotations is None:
             return light
         height, width = self.maps.shape[1:3]
         world = lat_long_directions(height, width).to(self.maps)
-        return Environment(light.lookup((world @ self.turns[view]).contiguous()))
+        return Environment(light.lookup((world @ self.rotations[view]).contiguous()))
 
     def evaluate(
         self,
@@ -54,7 +54,7 @@ class Lights:
         radiance: Callable[[SurfacePoints, Tensor, Environment], Tensor],
     ) -> Tensor:
         """``radiance(points, wo, environment)``, ``(N, 3)``, each row under the lighting of its view ``view (N,)``."""
-        group = range(len(self.group)) if self.turns is not None else self.group
+        group = range(len(self.group)) if self.rotations is not None else self.group
         first = torch.tensor([group.index(g) for g in group], device=view.device)  # view with the same lighting
         if len(set(group)) == 1:
             return radiance(points, wo, self.of_view(0))

@@ -139,15 +139,15 @@ def refine(
     before = view_errors(first, received, near)
     first = with_neutral_light(first, options.light_chromaticity)
     notes: list[str] = []
-    if (turns := near.light_turns) is not None:
-        notes.append("the lighting moves with the camera; the environment is that of view 0")
+    if (rotations := near.light_rotations) is not None:
+        notes.append(f"the lighting is fixed to the {images.light_frame}; the environment is that of view 0")
     elif len(set(images.light_group)) > 1:
         notes.append(f"{len(set(images.light_group))} lightings; the environment is that of view 0")
     elif light_follows_camera(first.mesh, near):
         advice = "if the lighting moves with it, set light to camera (flash) or turntable"
         notes.append(f"brightness varies with the camera; {advice}")
     with torch.random.fork_rng(devices=[]):
-        start = Start.of(first, turns=None if turns is None else turns[used])
+        start = Start.of(first, rotations=None if rotations is None else rotations[used])
         data = FixedSurface(start, first, received, near, used)
         fitted = _fitted(data, options, budget, notes)
         kept, parts, after = chosen(fitted, used, list(held), before)

@@ -234,7 +234,7 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, error) -> Tenso
     weight = view_weights(scene, position, normal, camera) * (cover.detach() > MIN_COVERAGE)
     exposure = unknowns.exposure[data.colored].exp()
     loss = color.new_zeros(())
-    if len(data.colored) > 1 and images.light_axes == "object" and len(set(images.light_group)) == 1:
+    if len(data.colored) > 1 and images.light_frame == "object" and len(set(images.light_group)) == 1:
         loss = weights.agreement * losses.agreement(color, weight)  # a point has one color under one lighting
     if weights.shading == 0.0:
         return loss

@@ -84,17 +84,17 @@ class Start:
     light: Tensor
 
     @classmethod
-    def of(cls, asset: Asset, texels: int = 256, turns: Tensor | None = None) -> Start:
+    def of(cls, asset: Asset, texels: int = 256, rotations: Tensor | None = None) -> Start:
         """Initial values of an asset in the box [-1, 1]^3; the material is extrapolated from its surface.
 
-        turns: ``(V, 3, 3)``, as in :class:`~reli3d.fit.lighting.Lights`; the lighting is the mean over the views.
+        rotations: ``(V, 3, 3)``, as in :class:`~reli3d.fit.lighting.Lights`; the lighting is the mean over the views.
         """
         found = rasterize_texels(asset.mesh, texels)
         points = surface_points(asset.mesh, asset.textures, found.face[found.valid], found.bary[found.valid])
         material = filled_grid(points.position, material_logits(points), START_GRID)
         radiance = asset.light.resized(LIGHT_ROWS).radiance
-        if turns is not None:
-            world = lat_long_directions(LIGHT_ROWS, device=radiance.device)[None, :, :] @ turns[:, None].mT
+        if rotations is not None:
+            world = lat_long_directions(LIGHT_ROWS, device=radiance.device)[None, :, :] @ rotations[:, None].mT
             radiance = Environment(radiance).lookup(world.contiguous()).mean(0)
         return cls(material, radiance.clamp(min=MIN_RELATIVE_RADIANCE * float(radiance.mean())).log())
 

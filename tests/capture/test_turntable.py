@@ -1,4 +1,4 @@
-"""Turntables: positions of a fixed camera, found by what does not change between images, and the axis of its views."""
+"""Turntables: positions of a fixed camera by what does not change between images, and the axis of its views."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from reli3d.capture.turntable import on_turntable, turns, turntable_positions
+from reli3d.capture import capture as function
+from reli3d.capture import moving
+from reli3d.capture.mapping import Map
+from reli3d.capture.turntable import on_turntable, rotates, turntable_positions
+from reli3d.errors import InputError
 from tests.support.mapped import overlap, view
 
 SIZE = 320, 240
@@ -45,6 +49,7 @@ def test_a_fixed_camera_and_a_turning_object_are_a_turntable():
 def test_a_turntable_that_is_photographed_from_several_heights():
     low, high = turning(9, 1), [np.roll(image, 30, 0) for image in turning(8, 2)]
     assert turntable_positions(low + high[:7]) == []  # too few to tell a position from a burst of hand-held images
+    assert len(turntable_positions(low + high[:7], fixed=True)) == 2
     for image in low + high:
         image[:50] = 128  # a wall without texture
     mixed = [image for pair in zip(low, high, strict=False) for image in pair] + low[8:]
@@ -66,6 +71,25 @@ def test_a_camera_that_moves_is_not_a_turntable():
     assert position.images == tuple(range(10))
 
 
+@pytest.mark.parametrize("step, reason", [(0.0, "features that do not turn"), (3.0, "an object that stands out")])
+def test_a_fixed_camera_and_a_table_that_does_not_turn_are_refused(step, reason, monkeypatch, tmp_path):
+    """Views of a table that does not turn are equal; those of a hand-held arc of 24 degrees are not.
+
+    step: degrees between neighboring views.  The maps have no points, and hence no object.
+    """
+    (tmp_path / "photographs").mkdir()
+    views = []
+    for k, image in enumerate(turning(9)):
+        cv2.imwrite(str(tmp_path / "photographs" / f"{k}.png"), image)
+        azimuth, height = np.radians(step * k), 1.0 + 0.1 * step * (k % 2)
+        views.append(view(k, np.array([3 * np.cos(azimuth), 3 * np.sin(azimuth), height])))
+    found = Map(tuple(views), np.zeros((0, 3)), np.zeros(0), np.zeros(0), ())
+    for module in (function, moving):
+        monkeypatch.setattr(module, "map_photos", lambda *_: found)
+    with pytest.raises(InputError, match=reason):
+        function.capture(tmp_path / "photographs", tmp_path / "object")
+
+
 @pytest.mark.parametrize(
     "tilt, height, fixed", [(0.0, 0.0, True), (0.3, 0.003, True), (3.0, 0.0, False), (0.0, 0.2, False)]
 )
@@ -78,5 +102,5 @@ def test_views_of_a_turntable_have_one_axis_in_camera_axes(tilt, height, fixed):
         moved = shown.translation + [0, 3.0 * height * (k % 2), 0]
         views.append(replace(shown, rotation=tilted @ shown.rotation, translation=tilted @ moved))
     assert on_turntable(views) == fixed
-    assert turns(views) and not turns([views[0]] * 15)
+    assert rotates(views) and not rotates([views[0]] * 15)
     assert not on_turntable(views[:2]) and not on_turntable([views[0]] * 15)  # a camera that is fixed to the object

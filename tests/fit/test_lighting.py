@@ -109,7 +109,7 @@ def test_groups_of_views_have_lights_of_their_own():
 
 def test_a_camera_light_is_turned_into_the_frame_of_the_object(moving_views):
     images = InputImages.of(moving_views, "camera")
-    lights = Lights(small_scene.sky().resized(64).radiance[None], images.light_group, images.light_turns)
+    lights = Lights(small_scene.sky().resized(64).radiance[None], images.light_group, images.light_rotations)
     for k in (0, 3):
         expected = camera_light(k, images.camera.c2w[k, :3, :3]).resized(64).radiance
         assert float((lights.of_view(k).radiance - expected).abs().mean()) < 0.02  # two bilinear lookups
@@ -124,8 +124,9 @@ def test_the_light_of_a_turntable_turns_about_y_with_cameras_of_any_height(movin
     if roll:
         c2w[:, :3, :2] = torch.stack([c2w[:, :3, 1], -c2w[:, :3, 0]], -1)
     images = InputImages.of(replace(moving_views, c2w=c2w), "turntable")
-    turns = images.light_turns
-    lights = Lights(small_scene.sky().resized(64).radiance[None], images.light_group, turns[0].T @ turns)
+    rotations = images.light_rotations
+    assert torch.equal(images.select([4, 1]).light_rotations, rotations[[4, 1]])
+    lights = Lights(small_scene.sky().resized(64).radiance[None], images.light_group, rotations)
     for k in range(VIEWS):
         expected = small_scene.sky().rotated(float(azimuth[k])).resized(64).radiance
         assert float((lights.of_view(k).radiance - expected).abs().mean()) < 0.02  # two bilinear lookups
@@ -196,7 +197,7 @@ def test_the_start_of_a_light_that_moves_with_the_camera_is_in_its_axes():
     c2w = torch.stack([look_at(eye) for eye in eyes])
     light = 0.1 + 5.0 * (lat_long_directions(64)[..., 1:2] > 0.95).float().expand(-1, -1, 3)
     ball = replace(small_scene.ball(), environment=Environment(light.contiguous()))
-    start = Start.of(ball, turns=c2w[:, :3, :3]).light.exp()[..., 0]
+    start = Start.of(ball, rotations=c2w[:, :3, :3]).light.exp()[..., 0]
     weight = (start > 1.0).float() * texel_solid_angles(*start.shape).to(start)[:, None]
     mean = (lat_long_directions(start.shape[0]) * weight[..., None]).sum((0, 1))
     expected = torch.tensor([0.0, 0.5**0.5, 0.5**0.5])
