@@ -137,15 +137,19 @@ def welded_faces(mesh: Mesh, label: Tensor | None = None) -> tuple[np.ndarray, n
 
 def face_components(mesh: Mesh) -> Tensor:
     """Component of every face, ``(F,)`` int64, numbered by lowest face; faces with a common position are connected."""
-    faces, _ = welded_faces(mesh)
+    label = _components(welded_faces(mesh)[0])
+    return torch.from_numpy(label).to(mesh.faces.device)
+
+
+def _components(faces: np.ndarray) -> np.ndarray:
     if not len(faces):
-        return torch.zeros(0, dtype=torch.int64, device=mesh.faces.device)
+        return np.zeros(0, np.int64)
     n = int(faces.max()) + 1
     rows, cols = faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1)
     label = graph_components(rows, cols, n)
     _, first, inverse = np.unique(label[faces[:, 0]], return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
-    return torch.from_numpy(rank[inverse].astype(np.int64)).to(mesh.faces.device)
+    return rank[inverse].astype(np.int64)
 
 
 def select_faces(mesh: Mesh, keep: Tensor) -> Mesh:
@@ -170,7 +174,8 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def largest_components(mesh: Mesh, min_fraction: float = 0.02) -> Mesh:
-    """The components with at least ``min_fraction`` of all faces, and always the largest one.
+    """The components with at least ``min_fraction`` of all faces, and always the largest one, without degenerate faces,
+    which have two corners at one position.
 
     min_fraction in [0, 1].  A mesh without faces is returned unchanged.
     """
@@ -178,11 +183,13 @@ def largest_components(mesh: Mesh, min_fraction: float = 0.02) -> Mesh:
         raise ValueError(f"min_fraction: expected a value in [0, 1], got {min_fraction}")
     if not len(mesh.faces):
         return mesh
-    label = face_components(mesh)
-    count = torch.bincount(label)
-    keep = count >= min_fraction * len(label)
-    keep[count.argmax()] = True
-    return mesh if bool(keep.all()) else select_faces(mesh, keep[label])
+    faces, sound = welded_faces(mesh)
+    label = _components(faces)
+    count = np.bincount(label)
+    large = count >= min_fraction * len(label)
+    large[count.argmax()] = True
+    keep = large[label] & sound
+    return mesh if keep.all() else select_faces(mesh, torch.from_numpy(keep).to(mesh.faces.device))
 
 
 def report(mesh: Mesh) -> MeshReport:
