@@ -23,7 +23,7 @@ from reli3d._bridge import expect, full_precision, present
 from reli3d.errors import InputError
 from reli3d.geometry.bake import bake
 from reli3d.geometry.cover import FIELD_MAX, cover_silhouettes
-from reli3d.geometry.mesh import Mesh, largest_components, weld
+from reli3d.geometry.mesh import Mesh, largest_components, weld, without_degenerate_faces
 from reli3d.geometry.normals import displace_to_normals
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
@@ -89,10 +89,11 @@ def extract(field: Field, resolution: int) -> Mesh:
     Components below MIN_PART_FRACTION of the faces are removed.  Raises NoSurface, an InputError, if there is none.
     """
     if isinstance(field, LocalField):
-        mesh = largest_components(_bounded_surface(field, resolution), MIN_PART_FRACTION)
+        mesh = largest_components(without_degenerate_faces(_bounded_surface(field, resolution)), MIN_PART_FRACTION)
         mesh = taubin_smooth(mesh, iterations=field.model.preset.smoothing)  # predictions are noisy between cells
         return _with_predicted_normals(field, mesh.with_normals())
-    return largest_components(_free_surface(field, resolution), MIN_PART_FRACTION).with_normals()
+    mesh = without_degenerate_faces(_free_surface(field, resolution))
+    return largest_components(mesh, MIN_PART_FRACTION).with_normals()
 
 
 def _with_predicted_normals(field: LocalField, mesh: Mesh) -> Mesh:

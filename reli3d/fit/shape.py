@@ -22,7 +22,7 @@ from reli3d.fit.view_colors import MIN_COVERAGE, display_planes, view_colors, vi
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.grid import sample_grid, squared_laplacian
 from reli3d.geometry.hull import hull_distance, mask_distance
-from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
+from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, without_degenerate_faces
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.surface import extract_surface
 from reli3d.render.color import srgb_to_linear
@@ -145,7 +145,8 @@ def extracted(sdf: Tensor, bound: Tensor, grid: Grid) -> Mesh:
 
 def finished(sdf: Tensor, bound: Tensor, grid: Grid) -> Mesh:
     """The surface without small components, denoised (:func:`~reli3d.fit.facets.flattened`)."""
-    mesh = largest_components(extracted(sdf, bound, grid).detach(), MIN_PART_FRACTION)
+    mesh = without_degenerate_faces(extracted(sdf, bound, grid).detach())
+    mesh = largest_components(mesh, MIN_PART_FRACTION)
     return flattened(mesh).with_normals()
 
 

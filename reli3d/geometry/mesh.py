@@ -137,19 +137,15 @@ def welded_faces(mesh: Mesh, label: Tensor | None = None) -> tuple[np.ndarray, n
 
 def face_components(mesh: Mesh) -> Tensor:
     """Component of every face, ``(F,)`` int64, numbered by lowest face; faces with a common position are connected."""
-    label = _components(welded_faces(mesh)[0])
-    return torch.from_numpy(label).to(mesh.faces.device)
-
-
-def _components(faces: np.ndarray) -> np.ndarray:
+    faces, _ = welded_faces(mesh)
     if not len(faces):
-        return np.zeros(0, np.int64)
+        return torch.zeros(0, dtype=torch.int64, device=mesh.faces.device)
     n = int(faces.max()) + 1
     rows, cols = faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1)
     label = graph_components(rows, cols, n)
     _, first, inverse = np.unique(label[faces[:, 0]], return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
-    return rank[inverse].astype(np.int64)
+    return torch.from_numpy(rank[inverse].astype(np.int64)).to(mesh.faces.device)
 
 
 def select_faces(mesh: Mesh, keep: Tensor) -> Mesh:
@@ -166,6 +162,21 @@ def select_faces(mesh: Mesh, keep: Tensor) -> Mesh:
     return Mesh(mesh.vertices[used], new_index[faces.long()].reshape(-1, 3), *rest)
 
 
+def without_degenerate_faces(mesh: Mesh) -> Mesh:
+    """The faces whose corners lie at three positions; corners of the others at one position become one vertex.
+
+    A closed mesh remains closed.  Gradients pass through the vertex attributes.
+    """
+    first, label = weld(mesh.vertices)
+    sound = torch.from_numpy(welded_faces(mesh, label)[1]).to(mesh.faces.device)
+    if bool(sound.all()):
+        return mesh
+    one = torch.arange(len(mesh.vertices), device=mesh.faces.device)
+    flat = mesh.faces[~sound].reshape(-1).long()
+    one[flat] = first[label[flat]]
+    return select_faces(replace(mesh, faces=one[mesh.faces.long()].int()), sound)
+
+
 def joined(meshes: Sequence[Mesh]) -> Mesh:
     """The concatenation of at least one mesh, with positions and faces only; face indices continue."""
     starts = np.cumsum([0] + [len(m.vertices) for m in meshes])
@@ -174,8 +185,7 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def largest_components(mesh: Mesh, min_fraction: float = 0.02) -> Mesh:
-    """The components with at least ``min_fraction`` of all faces, and always the largest one, without degenerate faces,
-    which have two corners at one position.
+    """The components with at least ``min_fraction`` of all faces, and always the largest one.
 
     min_fraction in [0, 1].  A mesh without faces is returned unchanged.
     """
@@ -183,13 +193,11 @@ def largest_components(mesh: Mesh, min_fraction: float = 0.02) -> Mesh:
         raise ValueError(f"min_fraction: expected a value in [0, 1], got {min_fraction}")
     if not len(mesh.faces):
         return mesh
-    faces, sound = welded_faces(mesh)
-    label = _components(faces)
-    count = np.bincount(label)
-    large = count >= min_fraction * len(label)
-    large[count.argmax()] = True
-    keep = large[label] & sound
-    return mesh if keep.all() else select_faces(mesh, torch.from_numpy(keep).to(mesh.faces.device))
+    label = face_components(mesh)
+    count = torch.bincount(label)
+    keep = count >= min_fraction * len(label)
+    keep[count.argmax()] = True
+    return mesh if bool(keep.all()) else select_faces(mesh, keep[label])
 
 
 def report(mesh: Mesh) -> MeshReport:
