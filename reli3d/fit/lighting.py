@@ -1,4 +1,4 @@
-"""Lighting of the input images, by a map fixed to the object, camera or turntable, or one per group; shading by it."""
+"""Lighting of the input images, by a map fixed to the object, camera or room, or one per group; shading by it."""
 
 from __future__ import annotations
 

@@ -140,7 +140,8 @@ def refine(
     first = with_neutral_light(first, options.light_chromaticity)
     notes: list[str] = []
     if (rotations := near.light_rotations) is not None:
-        notes.append(f"the lighting is fixed to the {images.light_frame}; the environment is that of view 0")
+        moves = "turns about +Y" if images.light_frame == "turntable" else "moves"
+        notes.append(f"the lighting {moves} with the camera; the environment is that of view 0")
     elif len(set(images.light_group)) > 1:
         notes.append(f"{len(set(images.light_group))} lightings; the environment is that of view 0")
     elif light_follows_camera(first.mesh, near):
