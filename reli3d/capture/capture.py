@@ -14,15 +14,15 @@ import torch
 from PIL import Image
 
 from reli3d.capture.consistency import masked_views
-from reli3d.capture.mapping import Map, View, map_photos
+from reli3d.capture.mapping import View, map_photos
 from reli3d.capture.masks import is_empty, key_mask, touches_border
-from reli3d.capture.moving import Segmented, map_if_any, object_map, segmented_masks, without_moving
+from reli3d.capture.moving import Segmented, object_map, segmented_masks, without_moving
 from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
 from reli3d.capture.report import LEAST_FIT, LEAST_REGISTERED, SMALL_STEPS, CaptureReport, check, summary, widest_gap
-from reli3d.capture.rigidity import SMALLEST_GROUP, Frame, epipolar_fit, inside_mask
+from reli3d.capture.rigidity import Frame, epipolar_fit, inside_mask
 from reli3d.capture.scene import find_scene
 from reli3d.capture.sheet import contact_sheet
-from reli3d.capture.turntable import Position, on_turntable, rotates, turntable_positions
+from reli3d.capture.turntable import Position, map_on_turntable, on_turntable, turntable_positions
 from reli3d.errors import InputError, printable
 from reli3d.io.images import decode_image, unit
 from reli3d.output.folder import check_place, claimed
@@ -63,7 +63,8 @@ def capture(
     It holds ``images``, ``masks``, ``transforms.json`` (pinhole cameras, +Y up, the ground at y = 0, the object's
     longest side 1), ``capture.json`` (the report) and ``capture.png`` (masks, cameras and points).  The folder appears
     whole or not at all.  Checks that fail are in ``failed`` of the report.  Raises InputError where no object folder
-    can be made: fewer than 8 images, no map, no object, or fewer than 8 views that show the whole object.
+    can be made: fewer than 8 images, no map, a fixed camera and features that do not turn, no object, or fewer than 8
+    views that show the whole object.
     """
     options = options or CaptureOptions()
     source, output = Path(source), Path(output)
@@ -77,8 +78,12 @@ def capture(
     report = CaptureReport(len(photos), notes=notes, mask_method="given" if options.masks else options.mask_method)
     positions = _positions(photos, options, cut_out)
     known = _known_masks(photos, options, progress)
-    turning = _map_on_turntable(source, photos, positions, options, report, progress) if positions else None
-    first = turning or map_photos(photos, progress)
+    on_table = None
+    if positions:
+        on_table = map_on_turntable(source, photos, positions, report, progress, known=bool(options.turntable))
+    first = on_table or map_photos(photos, progress)
+    if cut_out and on_table is None and on_turntable(first.views):
+        notes.append("the cameras lie on a circle: if the object turned before a fixed camera, pass --turntable")
     if 2 * sum(p.flash for p in photos) > len(photos):
         report.lighting = "camera"
     scene = find_scene(first)
@@ -92,7 +97,7 @@ def capture(
             + ("give --masks, or take sharper images nearer to it" if enough else SMALL_STEPS),
         )
     report.surroundings_fit = epipolar_fit(first, segmented.masks, inside=False)
-    if turning is None:
+    if on_table is None:
         segmented, scene = without_moving(segmented, scene, known, report, progress)
     final, up, ground = object_map(segmented, scene, known, report, progress)
     report.epipolar_fit, report.surroundings_fit = round(report.epipolar_fit, 3), round(report.surroundings_fit, 3)
@@ -143,43 +148,13 @@ def _check_output(source: Path, output: Path, masks: Path | None) -> None:
 
 
 def _positions(photos: Sequence[Photo], options: CaptureOptions, cut_out: bool) -> list[Position]:
-    """Of a camera in front of a turntable, by the background; none where the camera moves."""
+    """The positions of a camera in front of a turntable; none where the camera moves."""
     if options.turntable is False or cut_out and not options.turntable:
         return []
     positions = turntable_positions([p.pixels for p in photos], fixed=bool(options.turntable))
     if options.turntable and not positions:
-        raise InputError("turntable", "expected images of one size in which the object turns, got others")
+        raise InputError("turntable", "expected images of a fixed camera in which the object turns, got others")
     return positions
-
-
-def _map_on_turntable(
-    source: Path,
-    photos: Sequence[Photo],
-    positions: Sequence[Position],
-    options: CaptureOptions,
-    report: CaptureReport,
-    progress: Progress,
-) -> Map | None:
-    """The map of what turns, and in ``report`` the lighting; None where the views are not those of a turntable."""
-    position = {photos[k].name: n for n, group in enumerate(positions) for k in group.images}
-    regions = [positions[position[p.name]].region for p in photos]
-    found = (map_photos if options.turntable else map_if_any)(photos, progress, regions)
-    views = found.views if found else ()
-    groups = [[v for v in views if position[v.photo.name] == n] for n in range(len(positions))]
-    groups = [group for group in groups if len(group) >= SMALLEST_GROUP]
-    if len(views) >= LEAST_REGISTERED * len(photos) and not any(map(rotates, groups)):
-        raise InputError(
-            source,
-            "expected an object that turns together with what it stands on, or a camera that moves around it, got a "
-            "fixed camera and features that do not turn; use a turntable with texture, or walk around the object",
-        )
-    turning = [on_turntable(group) for group in groups]
-    if not options.turntable and not (groups and all(turning)):
-        return None
-    places = f" at {len(groups)} positions" if len(groups) > 1 else ""
-    report.notes.append(f"turntable: the camera is fixed{places}, and the object turns")
-    report.lighting = "camera" if turning == [True] else "turntable"
-    return found
 
 
 def _known_masks(photos: Sequence[Photo], options: CaptureOptions, progress: Progress) -> dict[str, np.ndarray] | None:

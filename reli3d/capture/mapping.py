@@ -10,6 +10,7 @@ import signal
 import tempfile
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -171,6 +172,15 @@ def map_photos(
             "the object in small steps, and put one without texture on a sheet of newspaper",
         )
     return best
+
+
+def map_if_any(
+    photos: Sequence[Photo], progress: Progress, masks: Sequence[np.ndarray], lenses: Map | None = None
+) -> Map | None:
+    """:func:`map_photos`, or None where it finds no map."""
+    with suppress(InputError):
+        return map_photos(photos, progress, masks, lenses)
+    return None
 
 
 def _pycolmap() -> ModuleType:

@@ -32,7 +32,7 @@ def grabcut_mask(view: View, found: Map, scene: Scene, support: np.ndarray | Non
     of background seeds, instead of the map's.
     """
     points = found.points[scene.object]
-    feet = points - scene.plane.height(points)[:, None] * scene.plane.normal if scene.plane else points[:0]
+    feet = scene.plane.foot(points) if scene.plane else points[:0]
     (pixels, depth), (foot_pixels, foot_depth) = view.project(points), view.project(feet)
     pixels, foot_pixels = pixels[depth > 0], foot_pixels[foot_depth > 0]
     seeds = view.pixels[scene.object[view.points]]

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from reli3d.capture.consistency import aligned, hull_agreement, masked_views
 from reli3d.capture.fusion import fused_masks
-from reli3d.capture.mapping import Map, View, map_photos, point_mask
+from reli3d.capture.mapping import Map, View, map_if_any, point_mask
 from reli3d.capture.masks import grabcut_mask, is_empty, touches_border
-from reli3d.capture.photos import FEWEST, Photo, Progress
+from reli3d.capture.photos import FEWEST, Progress
 from reli3d.capture.report import LEAST_FIT, CaptureReport
 from reli3d.capture.rigidity import SMALLEST_GROUP, Group, completed_groups, epipolar_fit, rigid_groups
 from reli3d.capture.scene import Scene, find_scene
-from reli3d.errors import InputError
 
 COMPLETE_AGREEMENT = 0.99  # mean fraction filled by the hull above which masks count as complete
 RIGID_FIT = 0.95  # least epipolar fit of correct cameras
@@ -93,15 +91,6 @@ def without_moving(
     else:
         report.notes.append(f"{fit}: if something moves there, the cameras may be inaccurate")
     return segmented, scene
-
-
-def map_if_any(
-    photos: Sequence[Photo], progress: Progress, regions: list[np.ndarray], lenses: Map | None = None
-) -> Map | None:
-    """:func:`map_photos`, or None where it finds no map."""
-    with suppress(InputError):
-        return map_photos(photos, progress, regions, lenses)
-    return None
 
 
 def object_map(

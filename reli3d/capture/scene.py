@@ -35,7 +35,7 @@ class Plane:
     offset: float
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance ``(N,)`` of ``points (N, 3)``, positive above."""
+        """Signed distances ``(...)`` of ``points (..., 3)``, positive above."""
         return points @ self.normal + self.offset
 
     @property
@@ -45,9 +45,9 @@ class Plane:
         u /= np.linalg.norm(u)
         return np.stack([u, np.cross(self.normal, u), self.normal])
 
-    def foot(self, point: np.ndarray) -> np.ndarray:
-        """The point of the plane nearest to ``point (3,)``."""
-        return point - self.height(point) * self.normal
+    def foot(self, points: np.ndarray) -> np.ndarray:
+        """The nearest points of the plane to ``points (..., 3)``."""
+        return points - self.height(points)[..., None] * self.normal
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,9 @@ def find_plane(points: np.ndarray, eyes: np.ndarray, distance: float) -> Plane |
         plane = Plane(normal, float(offset))
         if (np.abs(plane.height(points)) < tolerance).mean() < LEAST_INLIERS:
             continue
-        if plane_area(plane, points, distance) > area and _below(plane, points, tolerance) <= MOST_BELOW:
-            best, area = plane, plane_area(plane, points, distance)
+        covered = plane_area(plane, points, distance)
+        if covered > area and _below(plane, points, tolerance) <= MOST_BELOW:
+            best, area = plane, covered
     for _ in range(3):
         if best is None:
             break

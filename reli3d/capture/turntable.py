@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from reli3d.capture.mapping import View
+from reli3d.capture.mapping import Map, View, map_if_any, map_photos
 from reli3d.capture.masks import cleaned
-from reli3d.capture.photos import FEWEST
+from reli3d.capture.photos import FEWEST, Photo, Progress
+from reli3d.capture.report import LEAST_REGISTERED, CaptureReport
 from reli3d.capture.rigidity import SMALLEST_GROUP
+from reli3d.errors import InputError
 
 REGION_SIDE = 160  # pixels along the width at which images are compared
 STILL = 3.0  # of 255: standard deviation between images up to which a pixel does not change: noise and JPEG
 LEAST_STILL = 0.1  # fraction of such pixels from which the camera is fixed; hand-held images have none
-SAME_POSITION = 0.5  # of the most similar pair's fraction of such pixels: a pair that has less is of two positions
+SAME_POSITION = 0.5  # of that fraction in the most similar pair of either image: a pair with less has two positions
 BORDER_STILL = 5.0  # of 255: standard deviation between images, of four fifths of the border's pixels
 CLIPPED = 8  # of 255: distance from black and white
 LEAST_ROTATION = 5.0  # degrees between two views of an object that turns
@@ -34,59 +37,77 @@ class Position:
 
 
 def turntable_positions(pixels: Sequence[np.ndarray], *, fixed: bool = False) -> list[Position]:
-    """The positions of the camera, if all images of each agree except at the turntable with the object; else none.
+    """The positions of the camera, if the images of each agree except at the turntable with the object; else none.
 
-    Images have one position if they are linked by pairs in which at least SAME_POSITION as many pixels agree as in the
-    most similar pair; each position has at least FEWEST images.  A camera is fixed where LEAST_STILL of the pixels do
-    not change, or nearly all of the image's border does not.  fixed: True where that is known; a position then has at
-    least SMALLEST_GROUP images.
+    pixels: ``(H, W, 3)`` uint8, of any sizes.  Images of one size have one position if they are linked by pairs in
+    which at least SAME_POSITION as many pixels agree as in the most similar pair of either image.  A camera is fixed
+    where LEAST_STILL of the pixels do not change, or nearly all of the image's border does not.  A position has at
+    least FEWEST images; without a position are at most 1 - LEAST_REGISTERED of all.  fixed: True where that is known; a
+    position then has at least SMALLEST_GROUP images.
     """
-    if len({p.shape for p in pixels}) != 1:
-        return []
-    small, shape, least = _small(pixels), pixels[0].shape[:2], SMALLEST_GROUP if fixed else FEWEST
-    every = [tuple(range(len(small)))]
-    for groups, known in ((_similar_images(small), False), (every, False), (every, True))[: 3 if fixed else 2]:
-        found = []
-        for group in groups:
-            region = _moving_region(small[list(group)], fixed=known) if len(group) >= least else None
-            if region is not None:
-                found.append(Position(group, cv2.resize(region, shape[::-1], interpolation=cv2.INTER_NEAREST)))
-        if len(found) == len(groups):
-            return found
-    return []
+    shapes = [p.shape for p in pixels]
+    sizes = [tuple(k for k, own in enumerate(shapes) if own == shape) for shape in dict.fromkeys(shapes)]
+    small = [_small(p) for p in pixels]
+    similar = [group for same_size in sizes for group in _similar_images(small, same_size)]
+    least = SMALLEST_GROUP if fixed else FEWEST
+    found = _with_regions(pixels, small, similar, least)
+    if len(found) < 2:
+        found = _with_regions(pixels, small, sizes, least) or found
+    return found or (_with_regions(pixels, small, sizes, least, fixed=True) if fixed else [])
 
 
-def _small(pixels: Sequence[np.ndarray]) -> np.ndarray:
-    """Images of one size ``(N, h, REGION_SIDE, 3)`` float32."""
-    size = REGION_SIDE, max(1, round(REGION_SIDE * pixels[0].shape[0] / pixels[0].shape[1]))
-    return np.stack([cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in pixels]).astype(np.float32)
+def _small(pixels: np.ndarray) -> np.ndarray:
+    """The image REGION_SIDE wide, float32."""
+    size = REGION_SIDE, max(1, round(REGION_SIDE * pixels.shape[0] / pixels.shape[1]))
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-def _similar_images(images: np.ndarray) -> list[tuple[int, ...]]:
-    """Groups of the images ``(N, H, W, 3)`` linked by pairs with enough pixels that do not change."""
-    same = np.zeros((len(images), len(images)))
-    for b in range(len(images)):
-        for a in range(b):
-            same[a, b] = _still(images[[a, b]])[0].mean()
-    count, group = connected_components(same > max(LEAST_STILL, SAME_POSITION * same.max()), directed=False)
-    return [tuple((group == k).nonzero()[0].tolist()) for k in range(count)]
+def _similar_images(small: Sequence[np.ndarray], same_size: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """Groups of images of one size, linked by pairs with enough pixels that do not change."""
+    images = np.stack([small[k] for k in same_size])
+    brightness, same = images.mean(-1), np.zeros((len(images), len(images)))
+    for b in range(1, len(images)):
+        deviation = np.abs(images[:b] - images[b]).max(-1) / 2
+        spread = np.stack([cv2.blur(d, (3, 3)) for d in deviation])
+        same[:b, b] = _unchanged(spread, (brightness[:b] + brightness[b]) / 2).mean((1, 2))
+    best = np.maximum(same, same.T).max(1)
+    linked = same > np.maximum(LEAST_STILL, SAME_POSITION * np.maximum.outer(best, best))
+    count, group = connected_components(linked, directed=False)
+    return [tuple(same_size[k] for k in (group == g).nonzero()[0]) for g in range(count)]
 
 
-def _still(images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels ``(H, W)`` that do not change and are not clipped, and the standard deviations."""
-    spread = cv2.blur(images.std(0).max(-1), (3, 3))
-    brightness = images.mean((0, 3))
-    return (spread < STILL) & (brightness > CLIPPED) & (brightness < 255 - CLIPPED), spread  # not overexposed sky
+def _with_regions(
+    pixels: Sequence[np.ndarray],
+    small: Sequence[np.ndarray],
+    groups: Sequence[tuple[int, ...]],
+    least: int,
+    *,
+    fixed: bool = False,
+) -> list[Position]:
+    """The groups of at least ``least`` images that have a region, if these are nearly all images; else none."""
+    found = []
+    for group in groups:
+        region = _moving_region(np.stack([small[k] for k in group]), fixed=fixed) if len(group) >= least else None
+        if region is not None:
+            size = pixels[group[0]].shape[1::-1]
+            found.append(Position(group, cv2.resize(region, size, interpolation=cv2.INTER_NEAREST)))
+    return found if sum(len(p.images) for p in found) >= LEAST_REGISTERED * len(pixels) else []
+
+
+def _unchanged(spread: np.ndarray, brightness: np.ndarray) -> np.ndarray:
+    """Pixels of small standard deviation that are not clipped, as in an overexposed sky."""
+    return (spread < STILL) & (brightness > CLIPPED) & (brightness < 255 - CLIPPED)
 
 
 def _moving_region(images: np.ndarray, *, fixed: bool) -> np.ndarray | None:
     """Mask ``(H, W)`` of where images ``(N, H, W, 3)`` of a fixed camera differ; None if it moves or nothing does."""
-    still, spread = _still(images)
+    spread = cv2.blur(images.std(0).max(-1), (3, 3))
     noise = float(np.quantile(spread, 0.05))
     if float(np.quantile(spread, 0.97)) < max(12.0, 4.0 * noise):
         return None
     ring = np.concatenate([spread[:4].ravel(), spread[-4:].ravel(), spread[:, :4].ravel(), spread[:, -4:].ravel()])
-    if not fixed and still.mean() < LEAST_STILL and float(np.quantile(ring, 0.8)) > BORDER_STILL:
+    still = _unchanged(spread, images.mean((0, 3))).mean()
+    if not fixed and still < LEAST_STILL and float(np.quantile(ring, 0.8)) > BORDER_STILL:
         return None
     moving = (spread > max(6.0, 3.0 * noise)).astype(np.uint8) * 255
     return cleaned(cv2.morphologyEx(moving, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)), None)
@@ -113,3 +134,42 @@ def on_turntable(views: Sequence[View]) -> bool:
     point, at = np.split(np.linalg.lstsq(rows, -shifts.ravel(), rcond=None)[0], 2)  # in the world, in camera axes
     away = np.linalg.norm(rotations @ point + shifts - at, axis=1)
     return bool(np.median(angles) < AXIS_ANGLE and np.median(away) < AXIS_SHIFT * np.linalg.norm(at))
+
+
+def map_on_turntable(
+    source: Path,
+    photos: Sequence[Photo],
+    positions: Sequence[Position],
+    report: CaptureReport,
+    progress: Progress,
+    *,
+    known: bool,
+) -> Map | None:
+    """The map of what turns, from features inside the regions; None if its views are not those of a turntable.
+
+    Sets the lighting of ``report`` and adds notes.  known: True where it is a turntable: views that are not those of
+    one only add a note.  Raises InputError if the features do not turn, and, where ``known``, without a map.
+    """
+    position_of = {photos[k].name: n for n, position in enumerate(positions) for k in position.images}
+    photos = [p for p in photos if p.name in position_of]
+    regions = [positions[position_of[p.name]].region for p in photos]
+    found = (map_photos if known else map_if_any)(photos, progress, regions)
+    views = found.views if found else ()
+    groups = [[v for v in views if position_of[v.photo.name] == n] for n in range(len(positions))]
+    groups = [group for group in groups if group]
+    if len(views) >= LEAST_REGISTERED * len(photos) and not any(map(rotates, groups)):
+        raise InputError(
+            source,
+            "expected an object that turns together with what it stands on, or a camera that moves around it, got a "
+            "fixed camera and features that do not turn; use a turntable with texture, or walk around the object",
+        )
+    fits = [on_turntable(group) for group in groups if len(group) >= SMALLEST_GROUP]
+    turning = bool(fits) and all(fits)
+    if not (turning or known):
+        return None
+    places = f" at {len(groups)} positions, one above the other" if len(groups) > 1 else ""
+    report.notes.append(f"turntable: the camera is fixed{places}, and the object turns")
+    if not turning:
+        report.notes.append("the cameras do not fit a turntable: if you moved around the object, omit --turntable")
+    report.lighting = "camera" if len(groups) == 1 else "turntable"
+    return found

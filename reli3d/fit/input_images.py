@@ -16,6 +16,7 @@ from reli3d.render.color import srgb_to_linear
 
 SATURATED_LINEAR = 0.97  # a brighter pixel may be clipped: its value is a lower bound
 LIGHT_FRAMES = "object", "camera", "turntable"
+VERTICAL = 0.1  # horizontal length of a unit direction, below which its azimuth is uncertain
 INSIDE_COVERAGE = 0.99  # minimum of a pixel and its neighbors that contain only the object
 
 
@@ -80,6 +81,7 @@ class InputImages:
         check("intrinsics", views.intrinsics, shape=(count, 4), like=images)
         camera = Camera(views.c2w, views.intrinsics, size, size).detach()
         group: tuple[int, ...] = ()
+        frame = light if isinstance(light, str) else "object"
         if not isinstance(light, str):
             numbers = {g: k for k, g in enumerate(dict.fromkeys(light))}
             group = tuple(numbers[g] for g in light)
@@ -90,9 +92,7 @@ class InputImages:
         linear = torch.empty_like(images)
         for k, image in enumerate(images.detach()):  # one at a time: less memory
             linear[k] = srgb_to_linear(image)
-        return cls(
-            linear, masks.detach(), camera, group, light if isinstance(light, str) else "object", silhouettes.detach()
-        )
+        return cls(linear, masks.detach(), camera, group, frame, silhouettes.detach())
 
     def __len__(self) -> int:
         return len(self.color)
@@ -112,12 +112,16 @@ class InputImages:
     def light_rotations(self) -> Tensor | None:
         """Rotations ``(V, 3, 3)`` from the axes of the lighting to the object's; None if they are the same.
 
-        ``turntable``: by the azimuth of the direction of view; elevation and roll of the cameras do not count.
+        ``turntable``: by the azimuth of the direction of view; elevation and roll of the cameras do not count.  For a
+        vertical one, by the azimuth of the images' upward direction.
         """
         rotations = self.camera.c2w[:, :3, :3]
         if self.light_frame != "turntable":
             return rotations if self.light_frame == "camera" else None
-        sin, cos = normalize(rotations[:, [0, 2], 2], dim=-1).unbind(-1)
+        backward, upward = rotations[:, :, 2], rotations[:, :, 1]
+        vertical = (backward[:, [0, 2]].norm(dim=-1) < VERTICAL)[:, None]
+        toward = torch.where(vertical, -backward[:, 1:2].sign() * upward[:, [0, 2]], backward[:, [0, 2]])
+        sin, cos = normalize(toward, dim=-1).unbind(-1)
         zero, one = torch.zeros_like(sin), torch.ones_like(sin)
         return torch.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos], -1).unflatten(-1, (3, 3))
 

@@ -24,7 +24,7 @@ CHROMATICITY_SIGMA = 0.25  # log color without brightness: variation that colore
 class Weights:
     """Weights of all terms; lengths in cells of the grid, colors in display values."""
 
-    outline: float = 30.0  # of :func:`outline`
+    outline: float = 30.0  # of the silhouettes
     agreement: float = 0.3  # of :func:`agreement`
     shading: float = 30.0  # of :func:`display_error` while the surface is fitted
     curvature: float = 0.5  # of the squared Laplacian of the signed distance, where silhouettes and colors say little

@@ -22,7 +22,7 @@ from reli3d.fit.view_colors import MIN_COVERAGE, display_planes, view_colors, vi
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.grid import sample_grid, squared_laplacian
 from reli3d.geometry.hull import hull_distance, mask_distance
-from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, without_degenerate_faces
+from reli3d.geometry.mesh import Mesh, largest_components, without_degenerate_faces
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.surface import extract_surface
 from reli3d.render.color import srgb_to_linear
@@ -139,8 +139,7 @@ def empty(sdf: Tensor, bound: Tensor) -> bool:
 
 def extracted(sdf: Tensor, bound: Tensor, grid: Grid) -> Mesh:
     """The zero set of ``max(sdf, bound)`` as a mesh with normals."""
-    mesh = extract_surface(torch.maximum(sdf, bound), radius=grid.radius)
-    return Mesh(mesh.vertices, mesh.faces, vertex_normals(mesh.vertices, mesh.faces))
+    return extract_surface(torch.maximum(sdf, bound), radius=grid.radius).with_normals()
 
 
 def finished(sdf: Tensor, bound: Tensor, grid: Grid) -> Mesh:

@@ -163,18 +163,18 @@ def select_faces(mesh: Mesh, keep: Tensor) -> Mesh:
 
 
 def without_degenerate_faces(mesh: Mesh) -> Mesh:
-    """The faces whose corners lie at three positions; corners of the others at one position become one vertex.
+    """``mesh`` without the faces that have two corners at one position; these corners become one vertex.
 
-    A closed mesh remains closed.  Gradients pass through the vertex attributes.
+    For meshes without UV.  A closed mesh remains closed.  Gradients pass through the vertices.
     """
     first, label = weld(mesh.vertices)
-    sound = torch.from_numpy(welded_faces(mesh, label)[1]).to(mesh.faces.device)
-    if bool(sound.all()):
+    valid = torch.from_numpy(welded_faces(mesh, label)[1]).to(mesh.faces.device)
+    if bool(valid.all()):
         return mesh
-    one = torch.arange(len(mesh.vertices), device=mesh.faces.device)
-    flat = mesh.faces[~sound].reshape(-1).long()
-    one[flat] = first[label[flat]]
-    return select_faces(replace(mesh, faces=one[mesh.faces.long()].int()), sound)
+    merged = torch.arange(len(mesh.vertices), device=mesh.faces.device)
+    corners = mesh.faces[~valid].reshape(-1).long()
+    merged[corners] = first[label[corners]]
+    return select_faces(replace(mesh, faces=merged[mesh.faces.long()].int()), valid)
 
 
 def joined(meshes: Sequence[Mesh]) -> Mesh:

@@ -9,6 +9,7 @@ from collections import Counter
 from pathlib import Path
 
 from reli3d.errors import InputError, shown
+from reli3d.fit.input_images import LIGHT_FRAMES
 from reli3d.io.files import read_bytes
 from reli3d.views.frames import Frame, file_within, number, rigid
 from reli3d.views.lens_keys import check_keys, lens_of
@@ -61,8 +62,8 @@ def read_transforms(path: Path) -> tuple[list[Frame], list[str]]:
         raise InputError(path, f"frames: expected at most {MAX_FRAMES}, got {len(frames)}; keep the views to be used")
     check_keys(str(path), data)
     lighting = data.get("lighting", "object")
-    if lighting not in ("object", "camera", "turntable"):
-        expected = "lighting: expected object, camera or turntable"
+    if lighting not in LIGHT_FRAMES:
+        expected = f"lighting: expected {', '.join(LIGHT_FRAMES)}"
         raise InputError(path, f"{expected}, got {shown(lighting)}; correct the camera file")
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict):

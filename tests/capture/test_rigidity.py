@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from reli3d.capture import capture as function
-from reli3d.capture import moving
+from reli3d.capture import mapping, moving
 from reli3d.capture.mapping import Map, View
 from reli3d.capture.report import CaptureReport
 from reli3d.capture.rigidity import Group, completed_groups, epipolar_fit, rigid_groups
@@ -107,7 +107,7 @@ def test_views_that_are_cut_off_are_not_the_reason_where_the_object_moves(moved,
             return first
         raise InputError("photographs", "expected images that overlap")
 
-    for module in (function, moving):
+    for module in (function, mapping):
         monkeypatch.setattr(module, "map_photos", mapped)
     options = function.CaptureOptions(masks=tmp_path / "masks", turntable=False)
     with pytest.raises(InputError, match="something else moves" if moved else "step back"):
@@ -135,7 +135,7 @@ def test_what_moves_around_the_object_is_left_out_of_a_second_map(monkeypatch):
             raise InputError("photographs", "expected images that overlap")
         return second
 
-    monkeypatch.setattr(moving, "map_photos", mapped)
+    monkeypatch.setattr(mapping, "map_photos", mapped)
     fit = epipolar_fit(first, masks, inside=False)
     assert fit < 0.8 and epipolar_fit(first, masks) > 0.97
     for expected, surroundings, failed in ((second, fit, 0), (first, fit, 1), (first, 0.9, 0)):

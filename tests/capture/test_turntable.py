@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from reli3d.capture import capture as function
-from reli3d.capture import moving
-from reli3d.capture.mapping import Map
-from reli3d.capture.turntable import on_turntable, rotates, turntable_positions
+from reli3d.capture import mapping, turntable
+from reli3d.capture.mapping import Map, View
+from reli3d.capture.report import CaptureReport
+from reli3d.capture.turntable import Position, on_turntable, rotates, turntable_positions
 from reli3d.errors import InputError
 from tests.support.mapped import overlap, view
 
 SIZE = 320, 240
+
+
+def quiet(stage: str, done: int, total: int) -> None:
+    """No progress."""
 
 
 def noise(rng, width: int, height: int, size: tuple[int, int]) -> np.ndarray:
@@ -61,6 +67,34 @@ def test_a_turntable_that_is_photographed_from_several_heights():
         assert overlap(position.region, ground_truth) > 0.8
 
 
+def test_images_between_the_positions_are_left_out():
+    low, high = turning(12, 1), [np.roll(image, 30, 0) for image in turning(9, 2)]
+    low[11] = low[10].copy()  # the table paused
+    between = [np.roll(image, 10 + 7 * k, (0, 1)) for k, image in enumerate(turning(4, 3))]
+    positions = turntable_positions(low + between + high)
+    assert [len(p.images) for p in positions] == [12, 9]
+    assert not {12, 13, 14, 15} & {k for p in positions for k in p.images}
+    assert turntable_positions(low[:8] + between + high[:3]) == []  # fewer than 80 % have a position
+
+
+def test_a_turntable_fills_more_of_the_image_from_above():
+    low, high = turning(9, 1), turning(9, 2)
+    rng = np.random.default_rng(3)
+    for image in high:
+        image[:] = np.roll(image, 30, 0)
+        image[60:] = noise(rng, 40, 23, (320, 180))
+    assert [len(p.images) for p in turntable_positions(low + high)] == [9, 9]
+
+
+def test_a_camera_may_be_turned_to_portrait_at_one_height():
+    low, high = turning(9, 1), [np.rot90(image).copy() for image in turning(8, 2)]
+    first, second = turntable_positions(low + high)
+    assert first.region.shape == (240, 320) and second.region.shape == (320, 240)
+    ground_truth = np.zeros(SIZE[::-1], bool)
+    ground_truth[80:200, 100:220] = True
+    assert overlap(second.region, np.rot90(ground_truth)) > 0.8
+
+
 def test_a_camera_that_moves_is_not_a_turntable():
     background = noise(np.random.default_rng(0), 40, 30, SIZE)
     moving = [np.roll(background, 9 * k, 1) for k in range(10)]
@@ -84,10 +118,53 @@ def test_a_fixed_camera_and_a_table_that_does_not_turn_are_refused(step, reason,
         azimuth, height = np.radians(step * k), 1.0 + 0.1 * step * (k % 2)
         views.append(view(k, np.array([3 * np.cos(azimuth), 3 * np.sin(azimuth), height])))
     found = Map(tuple(views), np.zeros((0, 3)), np.zeros(0), np.zeros(0), ())
-    for module in (function, moving):
+    for module in (function, mapping):
         monkeypatch.setattr(module, "map_photos", lambda *_: found)
     with pytest.raises(InputError, match=reason):
         function.capture(tmp_path / "photographs", tmp_path / "object")
+
+
+def mapped(names: range, elevation: float) -> list[View]:
+    """Views of a ring around +Z."""
+    up, out = np.sin(elevation), np.cos(elevation)
+    azimuth = 2 * np.pi * np.arange(len(names)) / len(names)
+    return [view(k, 3 * np.array([out * np.cos(a), out * np.sin(a), up])) for k, a in zip(names, azimuth, strict=True)]
+
+
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize(
+    "high, registered, lighting, notes",
+    [
+        (0, 9, "camera", "the camera is fixed,"),
+        (9, 18, "turntable", "2 positions"),
+        (9, 11, "turntable", "2 positions"),
+    ],
+)
+def test_the_lighting_follows_from_the_positions_with_views(known, high, registered, lighting, notes, monkeypatch):
+    photos = [view(k, np.ones(3)).photo for k in range(9 + high)]
+    region = np.full(photos[0].pixels.shape[:2], 255, np.uint8)
+    positions = [Position(tuple(range(9)), region), Position(tuple(range(9, 9 + high)), region)][: 1 + (high > 0)]
+    views = (mapped(range(9), 0.3) + mapped(range(9, 9 + high), 0.9))[:registered]
+    found = Map(tuple(views), np.zeros((0, 3)), np.zeros(0), np.zeros(0), ())
+    monkeypatch.setattr(mapping, "map_photos", lambda *_: found)
+    monkeypatch.setattr(turntable, "map_photos", lambda *_: found)
+    report = CaptureReport(len(photos))
+    assert turntable.map_on_turntable(Path("photos"), photos, positions, report, quiet, known=known) is found
+    assert report.lighting == lighting and notes in report.notes[0] and len(report.notes) == 1
+
+
+def test_views_of_a_moving_camera_are_not_on_a_turntable(monkeypatch):
+    photos = [view(k, np.ones(3)).photo for k in range(10)]
+    position = Position(tuple(range(10)), np.full(photos[0].pixels.shape[:2], 255, np.uint8))
+    views = mapped(range(5), 0.3) + mapped(range(5, 10), 0.9)
+    found = Map(tuple(views), np.zeros((0, 3)), np.zeros(0), np.zeros(0), ())
+    monkeypatch.setattr(mapping, "map_photos", lambda *_: found)
+    monkeypatch.setattr(turntable, "map_photos", lambda *_: found)
+    report = CaptureReport(len(photos))
+    place = Path("photos"), photos, [position], report, quiet
+    assert turntable.map_on_turntable(*place, known=False) is None and not report.notes
+    assert turntable.map_on_turntable(*place, known=True) is found
+    assert report.lighting == "camera" and "omit --turntable" in report.notes[1]
 
 
 @pytest.mark.parametrize(

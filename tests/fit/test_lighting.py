@@ -121,7 +121,11 @@ def test_the_light_of_a_turntable_turns_about_y_with_cameras_of_any_height(movin
     azimuth, height = torch.tensor([0.0, 1.0, 2.5, 0.3, 4.0, 5.0]), torch.tensor([0.0, 0.0, 0.0, 1.5, 1.5, 1.5])
     eyes = torch.stack([azimuth.sin(), height, azimuth.cos()], -1)
     c2w = torch.stack([look_at(2.0 * eye) for eye in eyes])
-    if roll:
+    if roll == 0:  # straight down and up: the azimuth is that of the images' upward direction
+        for k, side in ((2, -1.0), (5, 1.0)):
+            toward = torch.stack([azimuth[k].sin(), torch.tensor(0.0), azimuth[k].cos()])
+            c2w[k] = look_at([0.0, -2.0 * side, 0.0], up=side * toward)
+    else:
         c2w[:, :3, :2] = torch.stack([c2w[:, :3, 1], -c2w[:, :3, 0]], -1)
     images = InputImages.of(replace(moving_views, c2w=c2w), "turntable")
     rotations = images.light_rotations
