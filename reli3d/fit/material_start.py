@@ -1,4 +1,4 @@
-"""Roughness and metallic from which the maps are fitted: those of the start or of a glossy metal or nonmetal."""
+"""Roughness and metallic from which the maps are fitted: those of the start or of a glossy metal or dielectric."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from reli3d.fit.unknowns import Unknowns
 from reli3d.geometry.rays import RayScene
 
 TRIAL_ROUGHNESS = 0.25
-TRIAL_METALLIC = {"metal": 0.95, "nonmetal": 0.05}
+TRIAL_METALLIC = {"metal": 0.95, "dielectric": 0.05}
 TRIAL = 0.08  # fraction of the budget for each of the three fits; 0.12 for MIN_STEPS
-# Ratio to the start's error up to which the nonmetal is preferred if it fits better than the metal: half metals fit
-# images of nonmetals almost as well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for glossy
-# nonmetals, 1.10 to 1.29 for others; for a painted metal 0.99 to 1.02, where the metal does not always fit better.
+# Ratio to the start's error up to which the dielectric is preferred if it fits better than the metal: half metals fit
+# images of dielectrics almost as well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for glossy
+# dielectrics, 1.10 to 1.29 for others; for a painted metal 0.99 to 1.02, where the metal does not always fit better.
 PREFERENCE = 1.05
 # Ratio to the start's error below which the metal is taken.  It is 0.975 to 1.19 for objects of metal, whose starts are
 # metallic, and 0.98 for an object of plastic and steel, which the metal's fit makes metallic everywhere.
@@ -33,7 +33,7 @@ IMAGE_ONLY = losses.Weights(**{name: float(name == "image") for name in vars(los
 
 
 def with_metallic(data: FixedSurface, metallic: float) -> FixedSurface:
-    """``data`` with constant roughness and metallic; the diffuse albedo of a nonmetal stays that of ``data``."""
+    """``data`` with constant roughness and metallic; the diffuse albedo of a dielectric stays that of ``data``."""
     maps = data.asset.textures
     base_color = maps.base_color
     if metallic < 0.5:
@@ -60,11 +60,11 @@ def image_error(unknowns: Unknowns, data: FixedSurface, pixels: Pixels, scene: R
 def best_material_start(
     unknowns: Unknowns, data: FixedSurface, held: list[int], weights: losses.Weights, budget: Budget, *, seed: int
 ) -> tuple[Unknowns, FixedSurface]:
-    """Fits the maps briefly from the start, a glossy metal and a glossy nonmetal; returns the best fit and its data.
+    """Fits the maps briefly from the start, a glossy metal and a glossy dielectric; returns the best fit and its data.
 
     From a rough or half metallic start, descent can end in a local minimum, with too high roughness and a lighting
     without highlights.  The error is the sum of the means over fitted views and over ``held``, indices of the held-out
-    views.  The nonmetal's may be ``PREFERENCE`` times the start's if it is below the metal's; the metal's must be below
+    views.  The dielectric's may be ``PREFERENCE`` times the start's if it is below the metal's; the metal's must be below
     ``METAL_GAIN`` times the start's.  After fewer than ``MIN_STEPS`` steps of a fit the next ones are left out.  seed:
     of pixels and light samples.
     """
@@ -85,7 +85,7 @@ def best_material_start(
         if budget.counts[part.name] < MIN_STEPS:
             break
         errors[name] = sum(image_error(*fits[name], of_views, scene, seed) for of_views in (fitted, check))
-    if errors["nonmetal"] < errors["metal"]:
-        errors["nonmetal"] /= PREFERENCE
+    if errors["dielectric"] < errors["metal"]:
+        errors["dielectric"] /= PREFERENCE
     errors["metal"] /= METAL_GAIN
     return fits[min(errors, key=lambda name: errors[name])]

@@ -193,7 +193,7 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
     if len(images) >= MIN_VIEWS_FOR_TRIALS:
         unknowns, data = best_material_start(unknowns, data, held, weights, budget, seed=seed)
         if data.asset is not surface:
-            kind = "metal" if float(data.asset.textures.metallic.mean()) > 0.5 else "nonmetal"
+            kind = "metal" if float(data.asset.textures.metallic.mean()) > 0.5 else "dielectric"
             notes.append(f"roughness and metallic are fitted from those of a glossy {kind}")
     fit_maps(unknowns, data, weights, budget, Part("maps", 1.0), seed=seed)
     return Fitted(first, surface, data.received, start, unknowns, images, data.asset)

@@ -25,7 +25,7 @@ FLASH_PROBABILITY = 0.15  # of a light at every camera, as the flash of a phone
 FLASH_RATIO = 0.5, 8.0  # of the object's mean radiance under it to that under the environment
 UNCHANGED_MATERIAL_PROBABILITY = 0.3  # of the materials of a relit sample
 METAL_PROBABILITY, NONMETAL_PROBABILITY = 0.08, 0.25  # of metallic set to 1, and to 0, everywhere
-GLOSSY_PROBABILITY, GLOSSY_GAIN = 0.4, 0.45  # of nonmetals whose roughness is multiplied: glazes, varnish, plastic
+GLOSSY_PROBABILITY, GLOSSY_GAIN = 0.4, 0.45  # of dielectrics whose roughness is multiplied: glazes, varnish, plastic
 
 
 @dataclass(frozen=True)
