@@ -19,7 +19,7 @@ from reli3d.capture.masks import is_empty, key_mask, touches_border
 from reli3d.capture.moving import Segmented, object_map, segmented_masks, without_moving
 from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
 from reli3d.capture.report import LEAST_FIT, LEAST_REGISTERED, SMALL_STEPS, CaptureReport, check, summary, widest_gap
-from reli3d.capture.rigidity import Frame, epipolar_fit, inside_mask
+from reli3d.capture.rigidity import Similarity, epipolar_fit, inside_mask
 from reli3d.capture.scene import find_scene
 from reli3d.capture.sheet import contact_sheet
 from reli3d.capture.turntable import Position, map_on_turntable, on_turntable, turntable_positions
@@ -250,7 +250,7 @@ def _least_compatible(views: Sequence[View], masks: dict[str, np.ndarray]) -> in
     return int(np.argmax(scores))
 
 
-def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float | None) -> tuple[Frame, np.ndarray]:
+def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float | None) -> tuple[Similarity, np.ndarray]:
     """``up`` to +Y, the longer side of the smallest rectangle around ``hull (N, 3)`` to X, the ground at 0, the middle
     above the origin, the longest side 1 or ``size`` millimeters; and the box ``(2, 3)`` of the hull in it.
     """
@@ -270,7 +270,7 @@ def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float |
     scale = (1.0 if size is None else size / 1000.0) / float((high - low).max())
     middle = (low + high) / 2
     middle[1] = bottom
-    return Frame(scale, turn, -scale * middle), scale * (np.stack([low, high]) - middle)
+    return Similarity(scale, turn, -scale * middle), scale * (np.stack([low, high]) - middle)
 
 
 def _object_points(final: Segmented, views: Sequence[View]) -> np.ndarray:
@@ -281,7 +281,9 @@ def _object_points(final: Segmented, views: Sequence[View]) -> np.ndarray:
     return final.found.points[(count >= 2) & (hits > 0.7 * count)]
 
 
-def _write(output: Path, views, masks, frame: Frame, box: np.ndarray, report: CaptureReport, points, progress) -> None:
+def _write(
+    output: Path, views, masks, frame: Similarity, box: np.ndarray, report: CaptureReport, points, progress
+) -> None:
     with claimed(output, RESULT_FILES) as replacing, replacing() as work:
         frames, thumbnails = [], []
         for name in ("images", "masks"):
@@ -294,7 +296,7 @@ def _write(output: Path, views, masks, frame: Frame, box: np.ndarray, report: Ca
             Image.fromarray(image).save(work / "images" / f"{name}.jpg", quality=95, subsampling=0)
             Image.fromarray(mask).save(work / "masks" / f"{name}.png")
             pose = view.c2w
-            pose[:3, :3] = frame.turn @ pose[:3, :3]
+            pose[:3, :3] = frame.rotation @ pose[:3, :3]
             pose[:3, 3] = frame.apply(view.eye)
             (cx, cy), (w, h) = view.principal.tolist(), view.photo.size
             paths = {"file_path": f"images/{name}.jpg", "mask_path": f"masks/{name}.png"}

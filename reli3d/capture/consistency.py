@@ -11,7 +11,7 @@ from torch.nn.functional import grid_sample, huber_loss, normalize, pad, softplu
 
 from reli3d.capture.mapping import View, point_mask, shown_pixels
 from reli3d.capture.masks import full_size, touches_border
-from reli3d.capture.rigidity import Frame
+from reli3d.capture.rigidity import Similarity
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import hull_grid, mask_distance
 from reli3d.views.check import agreement
@@ -163,7 +163,7 @@ def _explaining(pixels: np.ndarray, target: np.ndarray, weight: np.ndarray) -> n
 
 @torch.inference_mode(False)
 @torch.enable_grad()
-def aligned(fixed: Views, others: Views) -> Frame:
+def aligned(fixed: Views, others: Views) -> Similarity:
     """The similarity that moves the cameras of ``others`` to where their silhouettes agree with those of ``fixed``.
 
     Minimizes the distance between the viewing rays along the outlines of either side and the visual hull of the other
@@ -172,7 +172,7 @@ def aligned(fixed: Views, others: Views) -> Frame:
     """
     hulls = [visual_hull(v) for v in (fixed, others)]
     if any(len(h.points) == 0 for h in hulls):
-        return Frame(1.0, np.eye(3), np.zeros(3))
+        return Similarity(1.0, np.eye(3), np.zeros(3))
     low, high = hulls[0].box()
     middle, radius = (low + high) / 2, HULL_HALF_SIDE * max(float((high - low).max()), hulls[0].cell)
     (hull, *rays), (other_hull, *other_rays) = (_hull_and_rays(v, middle, radius) for v in (fixed, others))
@@ -193,7 +193,7 @@ def aligned(fixed: Views, others: Views) -> Frame:
     with torch.no_grad():
         turn, shift, scale = (x.double() for x in _moved(motion))
     shift = radius * shift + middle - scale * turn @ middle
-    return Frame(float(scale), turn.numpy(), shift.numpy())
+    return Similarity(float(scale), turn.numpy(), shift.numpy())
 
 
 def _moved(motion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

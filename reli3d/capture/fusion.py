@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from reli3d.capture.consistency import completed_masks
 from reli3d.capture.mapping import Map, View, grown, point_mask, shown_pixels
 from reli3d.capture.masks import COARSE_SIDE, full_size, grabcut, reduced, refined
-from reli3d.capture.rigidity import Frame
+from reli3d.capture.rigidity import Similarity
 from reli3d.capture.scene import Scene
 
 SIDES = COARSE_SIDE, COARSE_SIDE, 720  # pixels along the longer side of the images; memory limits the last
@@ -76,7 +76,7 @@ def fused_masks(found: Map, scene: Scene, masks: dict[str, np.ndarray]) -> dict[
     """
     if scene.plane is None or not masks:
         return masks
-    axes = Frame(1.0, scene.plane.axes.T, scene.plane.foot(scene.center))  # from the plane's axes to the map
+    axes = Similarity(1.0, scene.plane.axes.T, scene.plane.foot(scene.center))  # from the plane's axes to the map
     views = [v for v in found.views if v.photo.name in masks]
     inside = [masks[v.photo.name] for v in views]
     points = axes.inverse(found.points[scene.object])
@@ -116,7 +116,7 @@ class _Texture:
 
 
 def _plane_texture(
-    smalls: Sequence[_Small], inside: Sequence[np.ndarray], cover: Sequence[np.ndarray], axes: Frame, scene: Scene
+    smalls: Sequence[_Small], inside: Sequence[np.ndarray], cover: Sequence[np.ndarray], axes: Similarity, scene: Scene
 ) -> _Texture:
     """Median over views, after one gain for each view and channel, of what they show outside ``cover``.
 
@@ -148,7 +148,7 @@ def _plane_texture(
 
 
 def _plane_samples(
-    smalls, hidden: Sequence[np.ndarray], axes: Frame, u: np.ndarray, v: np.ndarray
+    smalls, hidden: Sequence[np.ndarray], axes: Similarity, u: np.ndarray, v: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colors ``(V, len(v), len(u), 3)`` of points of the plane in each view, NaN where it does not show them or
     ``hidden`` is 2; and where it shows them and ``hidden`` is 0.
@@ -199,10 +199,10 @@ def _outside(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.maximum(np.maximum(colors - cv2.dilate(others, window), cv2.erode(others, window) - colors), 0.0)
 
 
-def _expected(texture: _Texture, axes: Frame, small: _Small) -> _Expected:
+def _expected(texture: _Texture, axes: Similarity, small: _Small) -> _Expected:
     h, w = small.image.shape[:2]
     y, x = (np.mgrid[:h, :w] + 0.5) / small.scale
-    rays = small.view.rays(np.stack([x, y], -1).reshape(-1, 2)) @ axes.turn
+    rays = small.view.rays(np.stack([x, y], -1).reshape(-1, 2)) @ axes.rotation
     eye = axes.inverse(small.view.eye)
     along = -eye[2] / np.where(np.abs(rays[:, 2]) > 1e-9, rays[:, 2], 1e-9)
     hit = (eye[:2] + along[:, None] * rays[:, :2]) / texture.cell + len(texture.color) / 2 - 0.5
@@ -268,7 +268,7 @@ def _log_odds(image: np.ndarray, inside: np.ndarray, plane: _Expected, own: _Col
     return np.clip(cv2.GaussianBlur(np.clip(odds, -8, 8), (0, 0), 1.2), -limit, limit).astype(np.float32)
 
 
-def _occupied(smalls, evidence, axes: Frame, box, points, cells: int, growth: float) -> tuple[np.ndarray, float]:
+def _occupied(smalls, evidence, axes: Similarity, box, points, cells: int, growth: float) -> tuple[np.ndarray, float]:
     """Centers ``(N, 3)``, in ``axes``, of the outermost cells of the occupied ones that are connected to ``points``,
     and their size.
     """

@@ -126,7 +126,7 @@ def object_map(
     masks = _masks_of_moved_object(segmented, scene, second, groups, known, progress)
     result = Segmented(_posed(second, _aligned_groups(groups, by_name, masks), by_name), masks)
     if groups and scene.plane:
-        up = groups[0].turn @ _upward(first, scene)
+        up = groups[0].rotation @ _upward(first, scene)
         return result, up, float(groups[0].apply(scene.plane.foot(scene.center)) @ up)
     turns = np.stack([v.rotation.T @ by_name[v.photo.name].rotation for v in second.views])
     directions = turns @ _upward(first, scene)
@@ -222,8 +222,8 @@ def _aligned_groups(groups: Sequence[Group], views: dict[str, View], masks: dict
         own = [group.moved(views[name]) for name in names]
         if min(len(own), len(before)) >= SMALLEST_GROUP:
             motion = aligned(masked_views(before, masks), masked_views(own, masks))
-            shift = motion.apply(group.shift)
-            better = replace(group, scale=motion.scale * group.scale, turn=motion.turn @ group.turn, shift=shift)
+            turn, shift = motion.rotation @ group.rotation, motion.apply(group.translation)
+            better = Group(motion.scale * group.scale, turn, shift, group.names)
             moved = [better.moved(views[name]) for name in names]
             if hull_agreement(before + moved, masks) >= hull_agreement(before + own, masks):
                 group, own = better, moved

@@ -88,29 +88,29 @@ def _sampson(x: np.ndarray, y: np.ndarray, essential: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Frame:
-    """``x -> scale (turn x) + shift``: from a map to another one, or to the object folder."""
+class Similarity:
+    """``x -> scale rotation x + translation``: from a map to another one, or to the object folder."""
 
     scale: float
-    turn: np.ndarray  # (3, 3)
-    shift: np.ndarray  # (3,)
+    rotation: np.ndarray  # (3, 3)
+    translation: np.ndarray  # (3,)
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        return self.scale * points @ self.turn.T + self.shift
+        return self.scale * points @ self.rotation.T + self.translation
 
     def inverse(self, points: np.ndarray) -> np.ndarray:
-        return (points - self.shift) @ self.turn / self.scale
+        return (points - self.translation) @ self.rotation / self.scale
 
 
 @dataclass(frozen=True)
-class Group(Frame):
+class Group(Similarity):
     """Views, by name, that are related by one similarity from a map to another."""
 
     names: tuple[str, ...]
 
     def moved(self, view: View) -> View:
         """The view's pose in the other map."""
-        rotation = view.rotation @ self.turn.T
+        rotation = view.rotation @ self.rotation.T
         return replace(view, rotation=rotation, translation=-rotation @ self.apply(view.eye))
 
 

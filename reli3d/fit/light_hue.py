@@ -24,8 +24,8 @@ def with_neutral_light(asset: Asset, weight: float = CHROMATICITY_WEIGHT) -> Ass
 
     The factor of a channel is limited to [1 / MAX_FACTOR, MAX_FACTOR].  The base color is divided by it and clipped at
     1; below, diffuse colors in images do not change.
-    Highlights of dielectrics have the color of the lighting, so images are less saturated than base colors; a prediction
-    from images therefore assigns part of the object's color to the lighting.
+    Highlights of dielectrics have the color of the lighting, so images are less saturated than base colors; a
+    prediction from images therefore assigns part of the object's color to the lighting.
     """
     radiance = asset.light.radiance
     angle = texel_solid_angles(*radiance.shape[:2]).to(radiance)[:, None, None]

@@ -20,8 +20,9 @@ TRIAL_ROUGHNESS = 0.25
 TRIAL_METALLIC = {"metal": 0.95, "dielectric": 0.05}
 TRIAL = 0.08  # fraction of the budget for each of the three fits; 0.12 for MIN_STEPS
 # Ratio to the start's error up to which the dielectric is preferred if it fits better than the metal: half metals fit
-# images of dielectrics almost as well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for glossy
-# dielectrics, 1.10 to 1.29 for others; for a painted metal 0.99 to 1.02, where the metal does not always fit better.
+# images of dielectrics almost as well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for
+# glossy dielectrics, 1.10 to 1.29 for others; for a painted metal 0.99 to 1.02, where the metal does not always
+# fit better.
 PREFERENCE = 1.05
 # Ratio to the start's error below which the metal is taken.  It is 0.975 to 1.19 for objects of metal, whose starts are
 # metallic, and 0.98 for an object of plastic and steel, which the metal's fit makes metallic everywhere.
@@ -64,9 +65,9 @@ def best_material_start(
 
     From a rough or half metallic start, descent can end in a local minimum, with too high roughness and a lighting
     without highlights.  The error is the sum of the means over fitted views and over ``held``, indices of the held-out
-    views.  The dielectric's may be ``PREFERENCE`` times the start's if it is below the metal's; the metal's must be below
-    ``METAL_GAIN`` times the start's.  After fewer than ``MIN_STEPS`` steps of a fit the next ones are left out.  seed:
-    of pixels and light samples.
+    views.  The dielectric's may be ``PREFERENCE`` times the start's if it is below the metal's; the metal's must be
+    below ``METAL_GAIN`` times the start's.  After fewer than ``MIN_STEPS`` steps of a fit the next ones are left out.
+    seed: of pixels and light samples.
     """
     if budget.steps is not None and TRIAL * budget.steps < MIN_STEPS:
         return unknowns, data

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from reli3d.capture.consistency import aligned, completed_masks, masked_views
 from reli3d.capture.mapping import View
-from reli3d.capture.rigidity import Frame, Group
+from reli3d.capture.rigidity import Group, Similarity
 from tests.support.mapped import SIZE, view
 from tests.support.rigs import SPHERES
 
@@ -50,8 +50,8 @@ def pair_of_groups(spheres=SPHERES):
 def test_the_motion_between_two_groups_of_views_is_found_by_their_silhouettes():
     fixed, others, masks = pair_of_groups()
     turn = Rotation.from_rotvec(np.radians([1.0, -1.5, 1.0])).as_matrix()
-    wrong = Frame(0.98, turn, np.array([0.02, -0.03, 0.025]))  # of an object whose longest side is 0.8
-    moved = [Group(wrong.scale, wrong.turn, wrong.shift, ()).moved(v) for v in others]
+    wrong = Similarity(0.98, turn, np.array([0.02, -0.03, 0.025]))  # of an object whose longest side is 0.8
+    moved = [Group(wrong.scale, wrong.rotation, wrong.translation, ()).moved(v) for v in others]
     found = aligned(masked_views(fixed, masks), masked_views(moved, masks))
     corners = np.array(np.meshgrid(*BOX.T)).reshape(3, -1).T
     before = np.linalg.norm(wrong.apply(corners) - corners, axis=1)
@@ -65,7 +65,7 @@ def test_a_turn_that_no_silhouette_shows_stays_as_it_is():
     shift = np.array([0.02, 0.0, -0.02])
     moved = [Group(1.0, np.eye(3), shift, ()).moved(v) for v in others]
     found = aligned(masked_views(fixed, masks), masked_views(moved, masks))
-    assert np.degrees(Rotation.from_matrix(found.turn).magnitude()) < 0.5
+    assert np.degrees(Rotation.from_matrix(found.rotation).magnitude()) < 0.5
     middle = np.array([0.0, 0.0, 0.1])
     np.testing.assert_allclose(found.apply(middle + shift), middle, atol=0.004)
 
@@ -74,7 +74,7 @@ def test_groups_whose_masks_have_no_common_point_stay_where_they_are():
     fixed, others, masks = pair_of_groups()
     masks |= silhouettes(others[::2], ((-0.25, -0.3, 0.45, 0.05),))
     found = aligned(masked_views(fixed, masks), masked_views(others, masks))
-    assert found.scale == 1.0 and np.array_equal(found.turn, np.eye(3)) and not found.shift.any()
+    assert found.scale == 1.0 and np.array_equal(found.rotation, np.eye(3)) and not found.translation.any()
 
 
 def test_parts_that_a_few_masks_lack_are_added_and_nothing_else():

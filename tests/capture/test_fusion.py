@@ -14,7 +14,7 @@ from reli3d.capture.mapping import Map, View
 from reli3d.capture.moving import COMPLETE_AGREEMENT, Segmented, object_map
 from reli3d.capture.photos import Photo
 from reli3d.capture.report import CaptureReport
-from reli3d.capture.rigidity import Frame
+from reli3d.capture.rigidity import Similarity
 from reli3d.capture.scene import Plane, Scene
 from tests.support.mapped import view
 
@@ -135,7 +135,7 @@ def test_texels_that_enough_views_show_outside_the_masks_have_the_colors_of_the_
     """Two low parts, missing in the cover: the first is in the masks of 8 of 10 views, the other in those of 9."""
     plane, part, radius, at = 100, 200, 0.15, ((-0.4, 0.0), (0.4, 0.0))
     scene = Scene(np.zeros(3), 2.4, Plane(np.array([0.0, 0, 1]), 0.0), np.zeros(0, bool), np.zeros(0, bool))
-    axes = Frame(1.0, scene.plane.axes.T, np.zeros(3))
+    axes = Similarity(1.0, scene.plane.axes.T, np.zeros(3))
     smalls, inside, cover = [], [], []
     for k in range(10):
         azimuth = 2 * np.pi * k / 10
@@ -151,7 +151,7 @@ def test_texels_that_enough_views_show_outside_the_masks_have_the_colors_of_the_
         inside.append(low.reshape(h, w))
         cover.append(np.zeros((h, w), bool))
     texture = fusion._plane_texture(smalls, inside, cover, axes, scene)
-    index = np.array([[*place, 0.0] for place in at]) @ axes.turn[:, :2] / texture.cell + len(texture.color) / 2
+    index = np.array([[*place, 0.0] for place in at]) @ axes.rotation[:, :2] / texture.cell + len(texture.color) / 2
     first, other = (texture.color[v, u] for u, v in index.astype(int))
     assert np.abs(first - plane).max() < 1  # 2 views show it outside the masks; the median of all shows the part
     assert np.abs(other - part).max() < 1  # only one: all are taken

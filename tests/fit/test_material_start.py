@@ -44,7 +44,7 @@ def test_a_glossy_dielectric_is_found_and_a_metal_is_not_taken_for_one(metallic)
     "errors, metallic",
     [((1.0, 0.98, 1.1), 0.5), ((1.0, 0.95, 1.1), 0.95), ((1.0, 1.06, 1.04), 0.05), ((1.0, 1.03, 1.04), 0.5)],
 )
-def test_the_start_is_left_for_a_metal_that_fits_better_and_a_dielectric_that_fits_as_well(monkeypatch, errors, metallic):
+def test_the_start_is_left_for_a_better_metal_or_an_equal_dielectric(monkeypatch, errors, metallic):
     first = small_scene.ball()
     first = replace(first, textures=replace(first.textures, metallic=0.5))
     images = InputImages.of(small_scene.input_views(first, 2, 8))
