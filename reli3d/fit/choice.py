@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -121,8 +122,10 @@ class ViewRenderer:
         for view, (_, face, bary, wo) in enumerate(self.rays):
             at = surface_points(asset.mesh, asset.textures, face, bary)
             bounced = reflected(at, interpolate(self.received, asset.mesh.faces, face, bary))
-            light = asset.light if lights is None else lights.of_view(view)
-            lit.append((radiance(at, wo, light, samples=CHECK_SAMPLES, scene=self.scene, seed=view), bounced))
+            shaded = partial(radiance, samples=CHECK_SAMPLES, scene=self.scene, seed=view)
+            views = torch.full_like(face, view, dtype=torch.long)
+            direct = shaded(at, wo, asset.light) if lights is None else lights.evaluate(at, wo, views, shaded)
+            lit.append((direct, bounced))
         return lit
 
     @torch.no_grad()

@@ -51,17 +51,18 @@ class Lights:
         points: SurfacePoints,
         wo: Tensor,
         view: Tensor,
-        radiance: Callable[[SurfacePoints, Tensor, Environment], Tensor],
+        radiance: Callable[..., Tensor],
     ) -> Tensor:
-        """``radiance(points, wo, environment)``, ``(N, 3)``, each row under the lighting of its view ``view (N,)``."""
-        group = range(len(self.group)) if self.rotations is not None else self.group
-        first = torch.tensor([group.index(g) for g in group], device=view.device)  # view with the same lighting
-        if len(set(group)) == 1:
-            return radiance(points, wo, self.of_view(0))
+        """``radiance(points, wo, environment, rotations=...)``, ``(N, 3)``, each row under the lighting of its view
+        ``view (N,)``.
+        """
+        group = torch.tensor(self.group, device=view.device)[view]
         out = wo.new_zeros(wo.shape)
-        for k in torch.unique(first[view]).tolist():
-            rows = torch.nonzero(first[view] == k)[:, 0]
-            out = out.index_copy(0, rows, radiance(points[rows], wo[rows], self.of_view(k)))
+        for k in torch.unique(group).tolist():
+            rows = torch.nonzero(group == k)[:, 0]
+            rotations = None if self.rotations is None else self.rotations[view[rows]]
+            value = radiance(points[rows], wo[rows], Environment(self.maps[k].contiguous()), rotations=rotations)
+            out = out.index_copy(0, rows, value)
         return out
 
 
@@ -70,10 +71,14 @@ def radiance(
     wo: Tensor,
     light: Environment,
     *,
+    rotations: Tensor | None = None,
     samples: tuple[int, int, int],
     scene: RayScene | None,
     seed: int,
 ) -> Tensor:
-    """Linear radiance ``(N, 3)`` from ``points`` towards ``wo (N, 3)`` by direct light.  scene: None: no shadows."""
+    """Linear radiance ``(N, 3)`` from ``points`` towards ``wo (N, 3)`` by direct light.  scene: None: no shadows.
+
+    rotations: as in :func:`~reli3d.render.shading.shade`.
+    """
     options = ShadeOptions(samples=samples, seed=seed, diffuse_model=DIFFUSE_MODEL)
-    return shade(points, wo, light, scene=scene, options=options)
+    return shade(points, wo, light, scene=scene, options=options, rotations=rotations)

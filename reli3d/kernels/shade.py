@@ -29,7 +29,10 @@ COS_VIEW_MIN = wp.constant(1.0e-3)  # cosine with the view to which shading norm
 
 @wp.struct
 class Points:
-    """Arrays with a row per hit; ``pixel`` seeds its random numbers."""
+    """Arrays with a row per hit; ``pixel`` seeds its random numbers.
+
+    ``rotation``: from the frame of directions and normals to that of positions and shadow rays; no rows: the same.
+    """
 
     position: wp.array[wp.vec3]
     normal: wp.array[wp.vec3]
@@ -39,6 +42,7 @@ class Points:
     alpha: wp.array[float]
     metallic: wp.array[float]
     pixel: wp.array[wp.int32]
+    rotation: wp.array[wp.mat33]
 
 
 @wp.struct
@@ -259,6 +263,15 @@ def sample_value(surface: Surface, plan: Plan, draw: Draw, light: wp.vec3) -> wp
     return wp.vec3(wp.min(value[0], top), wp.min(value[1], top), wp.min(value[2], top))
 
 
+@wp.func
+def shadow_ray(plan: Plan, points: Points, i: int, ng: wp.vec3, direction: wp.vec3):
+    """Origin and direction of the shadow ray of a sample of hit ``i``, whose geometric normal is ``ng``."""
+    if points.rotation.shape[0] != 0:
+        ng = points.rotation[i] * ng
+        direction = points.rotation[i] * direction
+    return offset_origin(points.position[i], ng, direction, plan.scale), direction
+
+
 @wp.kernel
 def shade_kernel(
     start: int,
@@ -281,8 +294,8 @@ def shade_kernel(
         if d.factor > 0.0:
             lit = wp.bool(True)
             if shadows != 0:
-                origin = offset_origin(points.position[i], surface.ng, d.direction, plan.scale)
-                lit = not hit_occluded(mesh, origin, d.direction, wp.inf)
+                origin, direction = shadow_ray(plan, points, i, surface.ng, d.direction)
+                lit = not hit_occluded(mesh, origin, direction, wp.inf)
             if lit:
                 total = total + sample_value(surface, plan, d, lookup_envmap_uv(light.radiance, d.uv))
                 word = word | (1 << (s & 31))

@@ -5,8 +5,7 @@ import warp as wp
 from reli3d.kernels.embree import block_rays
 from reli3d.kernels.envmap import lookup_envmap_uv
 from reli3d.kernels.math import CONTRACT, INLINE
-from reli3d.kernels.rays import offset_origin
-from reli3d.kernels.shade import Light, Plan, Points, draw_sample, make_surface, sample_value
+from reli3d.kernels.shade import Light, Plan, Points, draw_sample, make_surface, sample_value, shadow_ray
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})
 
@@ -34,8 +33,9 @@ def shade_rays_kernel(
         t_max[k] = -1.0
         if d.factor > 0.0:
             t_max[k] = wp.inf
-            origins[k] = offset_origin(points.position[i], surface.ng, d.direction, plan.scale)
-            directions[k] = d.direction
+            origin, direction = shadow_ray(plan, points, i, surface.ng, d.direction)
+            origins[k] = origin
+            directions[k] = direction
             values[k] = sample_value(surface, plan, d, lookup_envmap_uv(light.radiance, d.uv))
 
 

@@ -103,12 +103,14 @@ def shade(
     scene: RayScene | None = None,
     options: ShadeOptions = DEFAULT,
     pixels: Tensor | None = None,
+    rotations: Tensor | None = None,
 ) -> Tensor:
     """Reflected radiance ``(N, 3)`` of surface points towards ``wo`` under ``environment``; linear Rec. 709.
 
     wo: ``(N, 3)`` or ``(3,)`` unit, world frame, to the camera.  Surfaces are two-sided; shading normals that face away
     from ``wo`` are adjusted.  scene: occluders; None: no shadows.  pixels: ``(N,)`` int32, seeds each point's samples
-    with ``options.seed``; None: the row number.  Non-finite inputs give NaN.
+    with ``options.seed``; None: the row number.  rotations: ``(N, 3, 3)``, from the environment's axes to those of the
+    points, without gradient; None: they are the same.  Non-finite inputs give NaN.
 
     First derivatives reach normal (only the tangential component is meaningful: optimize ``normalize(x)``), base_color,
     roughness, metallic and the environment's texels, at constant directions, densities, MIS weights and visibility.
@@ -117,10 +119,17 @@ def shade(
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
     >>> radiance = reli3d.shade(points, wo, reli3d.Environment.constant(torch.ones(3)))
     """
-    values = shaded_arrays(points, wo, environment, scene, options)
+    position, *axes, base_color, width, metallic = shaded_arrays(points, wo, environment, scene, options)
     plan, offsets = sampling_plan(options, scene)
     n, device = len(points), points.position.device
-    job = _Job(plan, sum(options.samples), scene, environment.cdf, offsets.to(device))
+    if rotations is None:
+        rotations = position.new_empty(0, 3, 3)
+    else:  # the samples are drawn in the environment's frame
+        check("rotations", rotations, shape=(n, 3, 3), like=position)
+        rotations = rotations.detach().contiguous()
+        axes = [(v[:, None] @ rotations)[:, 0] for v in axes]
+    job = _Job(plan, sum(options.samples), scene, environment.cdf, offsets.to(device), rotations)
+    values = position, *axes, base_color, width, metallic
     if pixels is None:
         pixels = torch.arange(n, dtype=torch.int32, device=device)
     check("pixels", pixels, shape=(n,), like=points.position, dtype=torch.int32)
@@ -136,6 +145,7 @@ class _Job:
     scene: RayScene | None
     cdf: EnvironmentCDF
     offsets: Tensor
+    rotations: Tensor
 
 
 class _Shade(torch.autograd.Function):
@@ -187,13 +197,13 @@ class _Shade(torch.autograd.Function):
 def _inputs(tensors: Sequence[Tensor], job: _Job) -> list:
     """Points and environment as the kernels take them."""
     *values, radiance, pixels = tensors
-    return [struct_of_points(values, pixels), struct_of_light(radiance, job.cdf, job.offsets)]
+    return [struct_of_points(values, pixels, rotation=job.rotations), struct_of_light(radiance, job.cdf, job.offsets)]
 
 
-def struct_of_points(values: Sequence[Tensor], pixels: Tensor) -> kernels.Points:
-    """Contiguous arrays in the order of :func:`shaded_arrays`, and the seed index of each point."""
+def struct_of_points(values: Sequence[Tensor], pixels: Tensor, **rotation: Tensor) -> kernels.Points:
+    """Contiguous arrays in the order of :func:`shaded_arrays`, the seed index of each point, and ``rotation``."""
     names = ("position", "normal", "ng", "wo", "base_color", "alpha", "metallic")
-    return struct_of(kernels.Points, **dict(zip(names, values, strict=True)), pixel=pixels)
+    return struct_of(kernels.Points, **dict(zip(names, values, strict=True)), pixel=pixels, **rotation)
 
 
 def struct_of_light(radiance: Tensor, cdf: EnvironmentCDF, offsets: Tensor) -> kernels.Light:

@@ -121,6 +121,33 @@ def test_bad_input_is_named(device):
             shade(**{"points": SurfacePoints(**own), "options": ShadeOptions(**options), **call, **given})
 
 
+def test_lighting_in_a_frame_of_its_own_is_that_of_turned_points_and_occluders(device):
+    """Turning the surface, the occluders and the eye leaves an environment and the samples as they are."""
+    _, inputs = gradient_inputs(device, n=2000)
+    normal, *rest, radiance = inputs
+    still = torch.tensor([0.0, 1.0, 0.0], device=device).expand(2000, 3)
+    wo = torch.nn.functional.normalize(still + 0.5 * normal.detach(), dim=-1)
+    place = normal.detach() * torch.tensor([1.0, 0.0, 1.0], device=device)  # on a floor, under a ball
+    ball = shadow_caster(device)
+    floor = torch.tensor([[-2.0, 0, -2], [-2, 0, 2], [2, 0, 2], [2, 0, -2]], device=device)
+    vertices = torch.cat([ball.vertices, floor])
+    corners = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32, device=device)
+    faces = torch.cat([ball.faces, corners + len(ball.vertices)])
+    axis = torch.tensor([0.6, -0.2, 0.5], device=device)
+    rotation = torch.linalg.matrix_exp(torch.linalg.cross(axis.expand(3, 3), torch.eye(3, device=device)))
+    weight = torch.rand(2000, 3, generator=torch.Generator().manual_seed(2)).to(device)
+    rotations, identity, results = rotation.expand(2000, 3, 3), torch.eye(3, device=device), []
+    for turn, own in ((identity, rotations), (rotation, None), (identity, None)):
+        tilted = torch.nn.functional.normalize(still + 0.3 * normal, dim=-1)
+        given = at(*(v @ turn for v in (place, tilted, still, wo)), *rest)
+        scene = RayScene(vertices @ turn, faces)
+        got = shade(*given, Environment(radiance), scene=scene, rotations=own)
+        results.append([got.detach(), *torch.autograd.grad((got * weight).sum(), inputs)])
+    for got, expected, other in zip(*results, strict=True):
+        bound = 1e-3 * float(expected.abs().mean())  # rounding of directions; a few shadow rays pass edges differently
+        assert float((got - expected).abs().mean()) < bound < 0.1 * float((got - other).abs().mean())
+
+
 def gradient_inputs(device, n=400):
     normal, wo = points(n, seed=4)
     g = torch.Generator().manual_seed(9)
