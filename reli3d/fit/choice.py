@@ -79,7 +79,8 @@ class Fitted:
         asset, unknowns = self.surface, self.unknowns
         if material:
             grids, bend = ([material * grid for grid in grids] for grids in (unknowns.material, unknowns.bend))
-            change = replace(unknowns, material=grids, bend=bend, detail=material * unknowns.detail)
+            finish, detail = material * unknowns.finish, material * unknowns.detail
+            change = replace(unknowns, material=grids, finish=finish, detail=detail, bend=bend)
             asset = changed(self.material_start or asset, change)
         return replace(asset, environment=self.lights(light).of_view(0)) if light else asset
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reli3d._bridge import present
-from reli3d.fit.unknowns import Unknowns, bent, material_change, material_logits, material_of, unit
+from reli3d.fit.unknowns import Unknowns, bent, changed_logits, material_logits, material_of, unit
 from reli3d.geometry.bake import bake, rasterize_texels
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
@@ -85,9 +85,8 @@ def changed(asset: Asset, unknowns: Unknowns) -> Asset:
         uv = (torch.stack([column, row], -1).float() + 0.5) / size
         face, bary = texels.face.reshape(-1)[index], texels.bary.reshape(-1, 2)[index]
         old = surface_points(asset.mesh, asset.textures, face, bary)
-        logits = material_logits(old) + material_change(unknowns, position)
-        logits[:, :3] += sample_texture(unknowns.detail, uv)
-        color, roughness, metallic = material_of(logits)
+        detail = sample_texture(unknowns.detail, uv)
+        color, roughness, metallic = material_of(changed_logits(unknowns, material_logits(old), position, detail))
         world, _ = bent(unknowns, position, old.normal)
         return _maps(SurfacePoints(position, old.ng, world, color, roughness, metallic), normal, tangent)
 
