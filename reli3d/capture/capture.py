@@ -82,7 +82,7 @@ def capture(
     if positions:
         on_table = map_on_turntable(source, photos, positions, report, progress, known=bool(options.turntable))
     first = on_table or map_photos(photos, progress)
-    if cut_out and on_table is None and on_turntable(first.views):
+    if cut_out and options.turntable is None and on_turntable(first.views):
         notes.append("the cameras lie on a circle: if the object turned before a fixed camera, pass --turntable")
     if 2 * sum(p.flash for p in photos) > len(photos):
         report.lighting = "camera"
@@ -103,7 +103,7 @@ def capture(
     report.epipolar_fit, report.surroundings_fit = round(report.epipolar_fit, 3), round(report.surroundings_fit, 3)
     report.registered = len(final.found.views)
     registered = {v.photo.name for v in final.found.views}
-    report.lost = [p.name for p in photos if p.name not in registered]
+    report.lost = [p.name for p in photos if p.name not in registered and p.name not in report.left_out]
     report.separate = first.separate
     report.reprojection_error = round(final.found.mean_error, 3)
     report.plane = scene.plane is not None

@@ -17,11 +17,11 @@ SMALL_STEPS = "take sharp images of one object in small steps around it"
 class CaptureReport:
     """What was found, and which checks failed; written to ``capture.json``."""
 
-    images: int
+    images: int  # to be registered
     registered: int = 0
     lost: list[str] = field(default_factory=list)  # not registered
     separate: int = 0  # of these, images of the largest other map, as of another object or after a gap
-    left_out: dict[str, str] = field(default_factory=dict)  # registered, but excluded: name and reason
+    left_out: dict[str, str] = field(default_factory=dict)  # excluded: name and reason
     views: list[str] = field(default_factory=list)
     reprojection_error: float = 0.0  # pixels, mean
     object_points: int = 0

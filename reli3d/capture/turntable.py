@@ -151,6 +151,7 @@ def map_on_turntable(
     one only add a note.  Raises InputError if the features do not turn, and, where ``known``, without a map.
     """
     position_of = {photos[k].name: n for n, position in enumerate(positions) for k in position.images}
+    others = [p.name for p in photos if p.name not in position_of]
     photos = [p for p in photos if p.name in position_of]
     regions = [positions[position_of[p.name]].region for p in photos]
     found = (map_photos if known else map_if_any)(photos, progress, regions)
@@ -167,9 +168,14 @@ def map_on_turntable(
     turning = bool(fits) and all(fits)
     if not (turning or known):
         return None
-    places = f" at {len(groups)} positions, one above the other" if len(groups) > 1 else ""
+    places = f" at {len(groups)} positions" if len(groups) > 1 else ""
     report.notes.append(f"turntable: the camera is fixed{places}, and the object turns")
+    report.images = len(photos)
+    report.left_out |= dict.fromkeys(others, "not from a position of the camera")
     if not turning:
-        report.notes.append("the cameras do not fit a turntable: if you moved around the object, omit --turntable")
-    report.lighting = "camera" if len(groups) == 1 else "turntable"
+        report.notes.append(
+            "the cameras do not fit a turntable seen from one height before this background: if you moved around the "
+            "object, omit --turntable"
+        )
+    report.lighting = "camera" if len(groups) == 1 and turning else "turntable"
     return found

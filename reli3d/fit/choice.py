@@ -78,10 +78,7 @@ class Fitted:
         """The fitted surface with the changes of material and lighting scaled by these weights."""
         asset, unknowns = self.surface, self.unknowns
         if material:
-            grids, bend = ([material * grid for grid in grids] for grids in (unknowns.material, unknowns.bend))
-            finish, detail = material * unknowns.finish, material * unknowns.detail
-            change = replace(unknowns, material=grids, finish=finish, detail=detail, bend=bend)
-            asset = changed(self.material_start or asset, change)
+            asset = changed(self.material_start or asset, unknowns, material)
         return replace(asset, environment=self.lights(light).of_view(0)) if light else asset
 
     def lights(self, weight: float) -> Lights:

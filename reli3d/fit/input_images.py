@@ -16,7 +16,7 @@ from reli3d.render.color import srgb_to_linear
 
 SATURATED_LINEAR = 0.97  # a brighter pixel may be clipped: its value is a lower bound
 LIGHT_FRAMES = "object", "camera", "turntable"
-VERTICAL = 0.1  # horizontal length of a unit direction, below which its azimuth is uncertain
+MIN_HORIZONTAL_LENGTH = 0.1  # of a unit direction; below, its azimuth is uncertain
 INSIDE_COVERAGE = 0.99  # minimum of a pixel and its neighbors that contain only the object
 
 
@@ -119,7 +119,7 @@ class InputImages:
         if self.light_frame != "turntable":
             return rotations if self.light_frame == "camera" else None
         backward, upward = rotations[:, :, 2], rotations[:, :, 1]
-        vertical = (backward[:, [0, 2]].norm(dim=-1) < VERTICAL)[:, None]
+        vertical = (backward[:, [0, 2]].norm(dim=-1) < MIN_HORIZONTAL_LENGTH)[:, None]
         toward = torch.where(vertical, -backward[:, 1:2].sign() * upward[:, [0, 2]], backward[:, [0, 2]])
         sin, cos = normalize(toward, dim=-1).unbind(-1)
         zero, one = torch.zeros_like(sin), torch.ones_like(sin)

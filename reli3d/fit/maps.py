@@ -116,7 +116,7 @@ def maps_loss(
     seed: int,
     independent: bool = True,
 ) -> Tensor:
-    """Loss of one step over ``rows`` of the pixels; gradients reach material, detail, bend, light and exposure.
+    """Loss of one step over ``rows`` of the pixels; gradients reach material, finish, detail, bend, light and exposure.
 
     direct: :func:`~reli3d.fit.lighting.radiance` with its samples and scene.  seed: of the light samples.  independent:
     as in :func:`~reli3d.fit.losses.estimated_error`.

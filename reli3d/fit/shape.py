@@ -195,7 +195,7 @@ def shape_loss(
     seed: int,
     independent: bool = True,
 ) -> Tensor:
-    """Loss of one step of the surface fit; gradients reach every part of ``unknowns`` except ``detail``.
+    """Loss of one step of the surface fit; gradients reach ``unknowns`` but for ``detail`` and ``bend``.
 
     progress: progress of the fit in [0, 1].  seed: random seed of the step's points, views and light samples.
     independent: as in :func:`~reli3d.fit.losses.estimated_error`.

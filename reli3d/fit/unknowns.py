@@ -28,7 +28,7 @@ MAX_ROUGHNESS, MIN_ROUGHNESS = 1.0, 0.05  # below, a lobe is narrower than the e
 MATERIAL_GRIDS = (4, 8, 16, 32)  # points along a side of the box
 FINISH_GRIDS = 2  # number of them that roughness and metallic have: images constrain these poorly
 COLOR_GRID = 4  # points along a side of the box of base colors
-MIN_BASE_COLOR, MAX_CHROMATICITY = 0.02, 0.8  # extent of that box: linear; log color without brightness
+DARKEST_COLOR, MAX_CHROMATICITY = 0.02, 0.8  # extent of that box: linear; log color without brightness
 START_GRID = 32  # points along a side of the box
 MAX_BEND = 0.3  # length of the vector added to a unit normal: 17 degrees
 BEND_GRIDS = (8, 16, 32, 64)  # finer than the material's, which must not explain errors of the normals
@@ -133,10 +133,10 @@ def changed_logits(unknowns: Unknowns, logits: Tensor, position: Tensor, detail:
 
 def _color_coordinates(color: Tensor) -> Tensor:
     """Log brightness and two log chromaticities of linear ``color (N, 3)``, in [-1, 1]."""
-    logs = color.clamp(min=MIN_BASE_COLOR).log()
+    logs = color.clamp(min=DARKEST_COLOR).log()
     brightness = logs.mean(1, keepdim=True)
     chromaticity = (logs - brightness)[:, [0, 2]] / MAX_CHROMATICITY
-    return torch.cat([1.0 - 2.0 * brightness / math.log(MIN_BASE_COLOR), chromaticity], 1).clamp(-1.0, 1.0)
+    return torch.cat([1.0 - 2.0 * brightness / math.log(DARKEST_COLOR), chromaticity], 1).clamp(-1.0, 1.0)
 
 
 def bent(unknowns: Unknowns, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:

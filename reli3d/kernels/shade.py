@@ -99,8 +99,8 @@ class Plan:
 
 @wp.struct
 class Draw:
-    """One sample: its direction in the world frame (``direction``), in the local frame (``wi``) and in coordinates of
-    the environment map (``uv``).
+    """One sample: its direction in the environment's frame (``direction``), in the local frame (``wi``) and in
+    coordinates of the environment map (``uv``).
 
     ``factor`` is w / (n p).  It is 0 for a rejected sample, whose ``facet`` is then undefined.  ``count`` is n.
     """

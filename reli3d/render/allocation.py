@@ -122,7 +122,8 @@ def _draw(
     plan, offsets = shading.sampling_plan(own, scene)
     light = shading.struct_of_light(environment.radiance.contiguous(), environment.cdf, offsets.to(device))
     pixels = torch.arange(n, dtype=torch.int32, device=device)
-    ins = [shading.struct_of_points([v.contiguous() for v in values], pixels), light, plan]
+    points = shading.struct_of_points([v.contiguous() for v in values], pixels, values[0].new_empty(0, 3, 3))
+    ins = [points, light, plan]
     origins, directions, value, density = (
         torch.empty(n, count, 3, device=device, dtype=torch.float32) for _ in range(4)
     )

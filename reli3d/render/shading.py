@@ -127,7 +127,7 @@ def shade(
     else:  # the samples are drawn in the environment's frame
         check("rotations", rotations, shape=(n, 3, 3), like=position)
         rotations = rotations.detach().contiguous()
-        axes = [(v[:, None] @ rotations)[:, 0] for v in axes]
+        axes = [(v[..., None] * rotations).sum(1) for v in axes]  # not a product of matrices: autocast would round it
     job = _Job(plan, sum(options.samples), scene, environment.cdf, offsets.to(device), rotations)
     values = position, *axes, base_color, width, metallic
     if pixels is None:
@@ -197,13 +197,13 @@ class _Shade(torch.autograd.Function):
 def _inputs(tensors: Sequence[Tensor], job: _Job) -> list:
     """Points and environment as the kernels take them."""
     *values, radiance, pixels = tensors
-    return [struct_of_points(values, pixels, rotation=job.rotations), struct_of_light(radiance, job.cdf, job.offsets)]
+    return [struct_of_points(values, pixels, job.rotations), struct_of_light(radiance, job.cdf, job.offsets)]
 
 
-def struct_of_points(values: Sequence[Tensor], pixels: Tensor, **rotation: Tensor) -> kernels.Points:
-    """Contiguous arrays in the order of :func:`shaded_arrays`, the seed index of each point, and ``rotation``."""
+def struct_of_points(values: Sequence[Tensor], pixels: Tensor, rotation: Tensor) -> kernels.Points:
+    """Contiguous arrays in the order of :func:`shaded_arrays`, the seed index and the rotation of each point."""
     names = ("position", "normal", "ng", "wo", "base_color", "alpha", "metallic")
-    return struct_of(kernels.Points, **dict(zip(names, values, strict=True)), pixel=pixels, **rotation)
+    return struct_of(kernels.Points, **dict(zip(names, values, strict=True)), pixel=pixels, rotation=rotation)
 
 
 def struct_of_light(radiance: Tensor, cdf: EnvironmentCDF, offsets: Tensor) -> kernels.Light:

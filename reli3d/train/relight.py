@@ -24,7 +24,7 @@ EXPOSURE = 0.35  # standard deviation of the logarithm of the exposure
 FLASH_PROBABILITY = 0.15  # of a light at every camera, as the flash of a phone
 FLASH_RATIO = 0.5, 8.0  # of the object's mean radiance under it to that under the environment
 UNCHANGED_MATERIAL_PROBABILITY = 0.3  # of the materials of a relit sample
-METAL_PROBABILITY, NONMETAL_PROBABILITY = 0.08, 0.25  # of metallic set to 1, and to 0, everywhere
+METAL_PROBABILITY, DIELECTRIC_PROBABILITY = 0.08, 0.25  # of metallic set to 1, and to 0, everywhere
 GLOSSY_PROBABILITY, GLOSSY_GAIN = 0.4, 0.45  # of dielectrics whose roughness is multiplied: glazes, varnish, plastic
 
 
@@ -43,7 +43,9 @@ class Finish:
         if rng.random() < UNCHANGED_MATERIAL_PROBABILITY:
             return Finish(1.0, 1.0, 0.0, None)
         kind = rng.random()
-        metallic = 1.0 if kind < METAL_PROBABILITY else 0.0 if kind < METAL_PROBABILITY + NONMETAL_PROBABILITY else None
+        metallic = (
+            1.0 if kind < METAL_PROBABILITY else 0.0 if kind < METAL_PROBABILITY + DIELECTRIC_PROBABILITY else None
+        )
         gloss = GLOSSY_GAIN if metallic == 0.0 and rng.random() < GLOSSY_PROBABILITY else 1.0
         gamma, gain = (float(np.exp(rng.normal(0, sigma))) for sigma in (0.35, 0.25))
         return Finish(gamma, gloss * gain, float(rng.normal(0, 0.08)), metallic)

@@ -82,7 +82,7 @@ def test_views_join_the_group_whose_motion_their_matches_fit():
     ]
     got = completed_groups(replace(found, matches=tuple(matches)), groups, masks)
     assert [set(g.names) for g in got] == [{str(k) for k in part} for part in (range(6), range(6, 11))]
-    assert [(g.scale, g.turn.tolist()) for g in got] == [(g.scale, g.turn.tolist()) for g in groups]
+    assert [(g.scale, g.rotation.tolist()) for g in got] == [(g.scale, g.rotation.tolist()) for g in groups]
 
 
 def test_wrong_matches_alone_are_no_motion():
@@ -163,7 +163,8 @@ def test_groups_of_views_have_the_motions_of_the_object():
     groups = rigid_groups(map_of(first), map_of(second))
     assert [len(g.names) for g in groups] == [7, 5]
     for group, turn, shift in zip(groups, turns, shifts, strict=True):
-        assert group.scale == pytest.approx(2.5) and np.allclose(group.turn, turn) and np.allclose(group.shift, shift)
+        assert group.scale == pytest.approx(2.5)
+        assert np.allclose(group.rotation, turn) and np.allclose(group.translation, shift)
         for name in group.names:
             pose, expected = group.moved(first[int(name)]), second[int(name)]
             assert np.allclose(pose.rotation, expected.rotation) and np.allclose(pose.eye, expected.eye)

@@ -153,6 +153,17 @@ def test_the_lighting_follows_from_the_positions_with_views(known, high, registe
     assert report.lighting == lighting and notes in report.notes[0] and len(report.notes) == 1
 
 
+def test_images_between_the_positions_do_not_count_as_lost(monkeypatch):
+    photos = [view(k, np.ones(3)).photo for k in range(12)]
+    position = Position(tuple(range(10)), np.full(photos[0].pixels.shape[:2], 255, np.uint8))
+    found = Map(tuple(mapped(range(10), 0.3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), ())
+    monkeypatch.setattr(mapping, "map_photos", lambda photos, *_: found if len(photos) == 10 else None)
+    report = CaptureReport(len(photos))
+    assert turntable.map_on_turntable(Path("photos"), photos, [position], report, quiet, known=False) is found
+    assert report.left_out == dict.fromkeys(("10", "11"), "not from a position of the camera")
+    assert report.images == 10
+
+
 def test_views_of_a_moving_camera_are_not_on_a_turntable(monkeypatch):
     photos = [view(k, np.ones(3)).photo for k in range(10)]
     position = Position(tuple(range(10)), np.full(photos[0].pixels.shape[:2], 255, np.uint8))
@@ -164,7 +175,7 @@ def test_views_of_a_moving_camera_are_not_on_a_turntable(monkeypatch):
     place = Path("photos"), photos, [position], report, quiet
     assert turntable.map_on_turntable(*place, known=False) is None and not report.notes
     assert turntable.map_on_turntable(*place, known=True) is found
-    assert report.lighting == "camera" and "omit --turntable" in report.notes[1]
+    assert report.lighting == "turntable" and "omit --turntable" in report.notes[1]
 
 
 @pytest.mark.parametrize(

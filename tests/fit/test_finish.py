@@ -11,7 +11,7 @@ from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights
 from reli3d.fit.maps import FixedSurface, fit_maps
 from reli3d.fit.transfer import changed
-from reli3d.fit.unknowns import Start, Unknowns, changed_logits
+from reli3d.fit.unknowns import Start, Unknowns, changed_logits, material_logits
 from reli3d.geometry.bake import bake, rasterize_texels
 from reli3d.render.asset import TextureSet
 from tests.support import small_scene
@@ -19,8 +19,8 @@ from tests.support import small_scene
 VIEWS, SIZE, STEPS, TEXELS = 12, 96, 120, 256
 
 
-def test_glossy_and_rough_stripes_are_told_apart_by_their_colors():
-    """Stripes of an eighth of the box: half the spacing of the finest grid of roughness over space."""
+def test_glossy_and_rough_stripes_are_separated_by_base_color():
+    """Stripes of half the spacing of the finest grid of roughness over space."""
     ball = small_scene.ball()
 
     def maps(position, normal):
@@ -54,3 +54,15 @@ def test_points_of_one_color_change_alike_and_the_color_gets_no_gradient_from_it
     assert float((change[0] - change[1]).abs().min()) > 0.05
     (gradient,) = torch.autograd.grad(after.sum(), detail)
     assert torch.equal(gradient, torch.ones_like(detail))
+
+
+def test_half_of_the_changes_is_half_way_to_the_fitted_finish():
+    """The grid is looked up at the fitted color, not at the color half way to it."""
+    ball = small_scene.ball()
+    unknowns = Unknowns.zero(torch.ones(2, 2, 2), 1, 8)
+    unknowns.material[0][..., :3] = 3.0
+    unknowns.finish[-1, ..., 0] = 2.0  # of bright colors
+    half, full = (material_logits(small_scene.centers(changed(ball, unknowns, weight))) for weight in (0.5, 1.0))
+    start = material_logits(small_scene.centers(ball))
+    assert float((full - start)[:, 3].min()) > 1.0
+    assert torch.allclose(half - start, 0.5 * (full - start), atol=0.02)  # linear interpolation between texels

@@ -123,9 +123,10 @@ def test_bad_input_is_named(device):
 
 def test_lighting_in_a_frame_of_its_own_is_that_of_turned_points_and_occluders(device):
     """Turning the surface, the occluders and the eye leaves an environment and the samples as they are."""
-    _, inputs = gradient_inputs(device, n=2000)
+    count = 2000
+    _, inputs = gradient_inputs(device, n=count)
     normal, *rest, radiance = inputs
-    still = torch.tensor([0.0, 1.0, 0.0], device=device).expand(2000, 3)
+    still = torch.tensor([0.0, 1.0, 0.0], device=device).expand(count, 3)
     wo = torch.nn.functional.normalize(still + 0.5 * normal.detach(), dim=-1)
     place = normal.detach() * torch.tensor([1.0, 0.0, 1.0], device=device)  # on a floor, under a ball
     ball = shadow_caster(device)
@@ -134,15 +135,24 @@ def test_lighting_in_a_frame_of_its_own_is_that_of_turned_points_and_occluders(d
     corners = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32, device=device)
     faces = torch.cat([ball.faces, corners + len(ball.vertices)])
     axis = torch.tensor([0.6, -0.2, 0.5], device=device)
-    rotation = torch.linalg.matrix_exp(torch.linalg.cross(axis.expand(3, 3), torch.eye(3, device=device)))
-    weight = torch.rand(2000, 3, generator=torch.Generator().manual_seed(2)).to(device)
-    rotations, identity, results = rotation.expand(2000, 3, 3), torch.eye(3, device=device), []
-    for turn, own in ((identity, rotations), (rotation, None), (identity, None)):
-        tilted = torch.nn.functional.normalize(still + 0.3 * normal, dim=-1)
-        given = at(*(v @ turn for v in (place, tilted, still, wo)), *rest)
-        scene = RayScene(vertices @ turn, faces)
-        got = shade(*given, Environment(radiance), scene=scene, rotations=own)
-        results.append([got.detach(), *torch.autograd.grad((got * weight).sum(), inputs)])
+    skew = torch.linalg.cross(axis.expand(3, 3), torch.eye(3, device=device))
+    turns = torch.linalg.matrix_exp(torch.stack([skew, -1.5 * skew, 0.0 * skew]))  # the environments' of every third
+    weight = torch.rand(count, 3, generator=torch.Generator().manual_seed(2)).to(device)
+    tilted = torch.nn.functional.normalize(still + 0.3 * normal, dim=-1)
+    which, results = torch.arange(count, device=device) % 3, []
+    points, eye = at(place, tilted, still, wo, *rest)
+    pixels = torch.arange(count, dtype=torch.int32, device=device)
+    scene, light = RayScene(vertices, faces), Environment(radiance)
+    together = shade(points, eye, light, scene=scene, rotations=turns[which])
+    apart = torch.zeros_like(together)
+    for k, turn in enumerate(turns):
+        rows = which == k
+        given = at(*(v[rows] @ turn for v in (place, tilted, still, wo)), *(v[rows] for v in rest))
+        scene_k = RayScene(vertices @ turn, faces)
+        apart = apart.index_put((rows,), shade(*given, light, scene=scene_k, pixels=pixels[rows]))
+    ignored = shade(points, eye, light, scene=scene)
+    for got in (together, apart, ignored):
+        results.append([got.detach(), *torch.autograd.grad((got * weight).sum(), inputs, retain_graph=True)])
     for got, expected, other in zip(*results, strict=True):
         bound = 1e-3 * float(expected.abs().mean())  # rounding of directions; a few shadow rays pass edges differently
         assert float((got - expected).abs().mean()) < bound < 0.1 * float((got - other).abs().mean())

@@ -243,5 +243,5 @@ def test_the_lighting_of_a_capture_is_read(tmp_path):
     transforms(tmp_path, frames, lighting="turntable")
     assert load_views(tmp_path).lighting == "turntable"
     transforms(tmp_path, frames, lighting="room")
-    with pytest.raises(InputError, match="lighting: expected object, camera or turntable, got 'room'"):
+    with pytest.raises(InputError, match="lighting: expected object, camera, turntable, got 'room'"):
         load_views(tmp_path)
