@@ -24,8 +24,8 @@ from reli3d.fit.unknowns import (
     START_GRID,
     Start,
     Unknowns,
-    changed_logits,
     light_maps,
+    material_change,
     material_of,
     unit,
 )
@@ -97,7 +97,7 @@ def step_of_a_fit(device, size, resolution):
         found = evaluate_hits(vertices, mesh.faces, found, eye, -wo)
         position = eye - found.t[:, None] * wo
         normal = unit(interpolate(normals, mesh.faces, found.face, found.bary))
-        material = material_of(changed_logits(unknowns, sample_grid(start.material, position), position))
+        material = material_of(sample_grid(start.material, position) + material_change(unknowns, position))
         light = (start.light + light_maps(unknowns.light)[0]).exp()
         given = [normal, *material, light, unknowns.exposure.exp()[view, None]]
         tick("points")

@@ -78,7 +78,9 @@ class Fitted:
         """The fitted surface with the changes of material and lighting scaled by these weights."""
         asset, unknowns = self.surface, self.unknowns
         if material:
-            asset = changed(self.material_start or asset, unknowns, material)
+            grids, bend = ([material * grid for grid in grids] for grids in (unknowns.material, unknowns.bend))
+            change = replace(unknowns, material=grids, bend=bend, detail=material * unknowns.detail)
+            asset = changed(self.material_start or asset, change)
         return replace(asset, environment=self.lights(light).of_view(0)) if light else asset
 
     def lights(self, weight: float) -> Lights:

@@ -147,7 +147,6 @@ def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
     number n of views per lighting exceeds it: a lighting smoother than the true one biases roughness upwards.
     """
     base, finish = ([grid[..., part] for grid in unknowns.material] for part in (slice(0, 3), slice(3, 5)))
-    finish.append(unknowns.finish)
     loss = weights.base_coarse / views * near_start(base) + weights.finish / views * near_start(finish)
     variation = torch.stack([total_variation(m) for m in light_maps(unknowns.light)]).sum()
     light = weights.light * near_start(unknowns.light) + weights.light_variation * variation

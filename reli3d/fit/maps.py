@@ -15,7 +15,7 @@ from reli3d.fit.bounce import reflected
 from reli3d.fit.budget import Budget, Part
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.lighting import Lights, radiance
-from reli3d.fit.unknowns import Start, Unknowns, bent, changed_logits, material_logits, material_of
+from reli3d.fit.unknowns import Start, Unknowns, bent, material_change, material_logits, material_of
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
@@ -25,7 +25,7 @@ from reli3d.render.points import SurfacePoints
 PIXELS_PER_STEP = 6144
 SHADING_SAMPLES = ((6, 6, 2), (12, 12, 4))  # of light, BSDF and cosine, in the first and the second half of a stage
 MAX_PIXELS = 400_000  # of all images: 51 MB; of more, a random subset
-LEARNING_RATES = {"material": 0.04, "finish": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
+LEARNING_RATES = {"material": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
 GRID_INTERVAL = 0.1  # of a stage's progress, after which the next finer map or grid is optimized as well
 DETAIL_FROM = 0.35  # progress from which the texture detail is optimized
 MATERIAL_UNTIL = 0.7  # progress at which the material is frozen, and the bend is reset and fitted with a stronger prior
@@ -116,16 +116,17 @@ def maps_loss(
     seed: int,
     independent: bool = True,
 ) -> Tensor:
-    """Loss of one step over ``rows`` of the pixels; gradients reach material, finish, detail, bend, light and exposure.
+    """Loss of one step over ``rows`` of the pixels; gradients reach material, detail, bend, light and exposure.
 
     direct: :func:`~reli3d.fit.lighting.radiance` with its samples and scene.  seed: of the light samples.  independent:
     as in :func:`~reli3d.fit.losses.estimated_error`.
     """
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
     detail = sample_texture(unknowns.detail, pixels.uv[rows])
-    logits = changed_logits(unknowns, pixels.logits[rows], position, detail)
+    change = material_change(unknowns, position)
+    change = torch.cat([change[:, :3] + detail, change[:, 3:]], 1)
     normal, turned = bent(unknowns, position, pixels.normal[rows])
-    points = SurfacePoints(position, pixels.ng[rows], normal, *material_of(logits))
+    points = SurfacePoints(position, pixels.ng[rows], normal, *material_of(pixels.logits[rows] + change))
     lights, exposure = Lights.of(unknowns, data.start, data.images), unknowns.exposure.exp()[view, None]
     bounced = reflected(points, pixels.received[rows])
 
@@ -137,7 +138,7 @@ def maps_loss(
     color, was = (c.clamp(min=losses.MIN_LINEAR).log() for c in colors)
     loss = loss + weights.palette * losses.palette(color, target) + weights.hue * losses.hue_drift(color, was)
     loss = loss + losses.priors(unknowns, weights, len(data.used))
-    loss = loss + losses.near_base_color((logits - pixels.logits[rows])[:, :3], weights, len(data.used))
+    loss = loss + losses.near_base_color(change[:, :3], weights, len(data.used))
     return loss + weights.bend * turned.square().sum(1).mean()
 
 
@@ -163,8 +164,7 @@ def fit_maps(
 ) -> None:
     """Fits lighting, exposures and material on a fixed surface, coarse to fine.
 
-    detail: fit the texture detail, the bend of the normals and the grid over base colors as well.  pixels: None: those
-    of :func:`traced`.
+    detail: fit the texture detail and the bend of the normals as well.  pixels: None: those of :func:`traced`.
 
     Errors of normals, shadows and interreflection would be baked into the base color.  While the material is fitted, a
     weakly regularized bend of the shading normals absorbs these errors.  Then the material is frozen, and the bend is
@@ -175,7 +175,7 @@ def fit_maps(
     count = len(pixels.order)
     if count == 0:
         return
-    names = ("light", "exposure", "material", *(("finish", "detail", "bend") if detail else ()))
+    names = ("light", "exposure", "material", *(("detail", "bend") if detail else ()))
     groups = []
     for which in names:
         for k, value in enumerate(unknowns.groups()[which]):
@@ -188,7 +188,7 @@ def fit_maps(
     for step, progress in budget.take(part):
         if detail and progress >= MATERIAL_UNTIL and not settled:
             settled = True
-            for value in (*unknowns.material, unknowns.finish, unknowns.detail):
+            for value in (*unknowns.material, unknowns.detail):
                 value.requires_grad_(False)
             unknowns.reset_bend()
         fade = fading(progress, settled)

@@ -72,8 +72,8 @@ def best_material_start(
     if budget.steps is not None and TRIAL * budget.steps < MIN_STEPS:
         return unknowns, data
     plain = deepcopy(unknowns)
-    for grid in (*(grid[..., 3:] for grid in plain.material), plain.finish):
-        grid.zero_()
+    for grid in plain.material:
+        grid[..., 3:] = 0.0
     scene = RayScene(data.asset.mesh.vertices, data.asset.mesh.faces)
     pixels = [traced(replace(data, used=views), scene, seed) for views in (data.used, held)]
     fits, errors = {"start": (unknowns, data)}, dict.fromkeys(("start", *TRIAL_METALLIC), math.inf)

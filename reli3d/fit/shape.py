@@ -17,7 +17,7 @@ from reli3d.fit.facets import flattened
 from reli3d.fit.fields import EvenAdam, blurred_grid
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.lighting import Lights, radiance
-from reli3d.fit.unknowns import Start, Unknowns, changed_logits, corrected, material_of, unit
+from reli3d.fit.unknowns import Start, Unknowns, corrected, material_change, material_of, unit
 from reli3d.fit.view_colors import MIN_COVERAGE, display_planes, view_colors, view_weights
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.grid import sample_grid, squared_laplacian
@@ -244,8 +244,8 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, error) -> Tenso
     view = torch.multinomial(weight[row].cpu(), 1, generator=rng)[:, 0].to(row.device)
     target = srgb_to_linear(color[row, view].detach())
     position, normal = position[row], normal[row]
-    start = sample_grid(data.start.material, position)
-    logits = changed_logits(unknowns, start, position)
+    change = material_change(unknowns, position)
+    logits = sample_grid(data.start.material, position) + change
     points = SurfacePoints(position, normal.detach(), normal, *material_of(logits))
     lights = Lights.of(unknowns, data.start, images)
     wo = unit(camera.c2w[view, :3, 3] - position).detach()
@@ -259,7 +259,7 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, error) -> Tenso
     # the same ratio of the terms as in the fit of the maps
     logs = points.base_color.clamp(min=losses.MIN_LINEAR).log()
     loss = loss + weights.shading * weights.palette * losses.palette(logs, target)
-    loss = loss + weights.shading * losses.near_base_color((logits - start)[:, :3], weights, len(data.colored))
+    loss = loss + weights.shading * losses.near_base_color(change[:, :3], weights, len(data.colored))
     return loss + weights.shading * losses.priors(unknowns, weights, len(data.images))
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reli3d._bridge import present
-from reli3d.fit.unknowns import Unknowns, bent, changed_logits, material_logits, material_of, unit
+from reli3d.fit.unknowns import Unknowns, bent, material_change, material_logits, material_of, unit
 from reli3d.geometry.bake import bake, rasterize_texels
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
@@ -73,12 +73,9 @@ def _means(values: Tensor, factor: int) -> Tensor:
     return torch.nn.functional.avg_pool2d(values.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0).contiguous()
 
 
-def changed(asset: Asset, unknowns: Unknowns, weight: float = 1.0) -> Asset:
-    """``asset`` with its vertex colors and the changes of material and normals baked into its textures.
-
-    weight: factor of the changes of material logits and of the bend.
-    """
-    size, scaled = asset.textures.size, replace(unknowns, bend=[weight * grid for grid in unknowns.bend])
+def changed(asset: Asset, unknowns: Unknowns) -> Asset:
+    """``asset`` with its vertex colors and the changes of material and normals baked into its textures."""
+    size = asset.textures.size
     texels = rasterize_texels(asset.mesh, size)
     parts = iter(torch.nonzero(texels.valid.reshape(-1))[:, 0].split(TEXELS_PER_CHUNK))  # of one call each
 
@@ -88,10 +85,10 @@ def changed(asset: Asset, unknowns: Unknowns, weight: float = 1.0) -> Asset:
         uv = (torch.stack([column, row], -1).float() + 0.5) / size
         face, bary = texels.face.reshape(-1)[index], texels.bary.reshape(-1, 2)[index]
         old = surface_points(asset.mesh, asset.textures, face, bary)
-        start, detail = material_logits(old), sample_texture(unknowns.detail, uv)
-        logits = torch.lerp(start, changed_logits(unknowns, start, position, detail), weight)
+        logits = material_logits(old) + material_change(unknowns, position)
+        logits[:, :3] += sample_texture(unknowns.detail, uv)
         color, roughness, metallic = material_of(logits)
-        world, _ = bent(scaled, position, old.normal)
+        world, _ = bent(unknowns, position, old.normal)
         return _maps(SurfacePoints(position, old.ng, world, color, roughness, metallic), normal, tangent)
 
     baked = bake(asset.mesh, size, at_texels, texels=texels, tangents=True, chunk=TEXELS_PER_CHUNK)

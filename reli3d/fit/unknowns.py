@@ -6,7 +6,6 @@ metallic; logarithms of radiance): zero is the start, and every value is valid.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import partial, reduce
 
@@ -27,8 +26,6 @@ LOGIT_MARGIN = 0.005  # from 0 and 1 at which values are clamped before the logi
 MAX_ROUGHNESS, MIN_ROUGHNESS = 1.0, 0.05  # below, a lobe is narrower than the environment's texels
 MATERIAL_GRIDS = (4, 8, 16, 32)  # points along a side of the box
 FINISH_GRIDS = 2  # number of them that roughness and metallic have: images constrain these poorly
-COLOR_GRID = 4  # points along a side of the box of base colors
-DARKEST_COLOR, MAX_CHROMATICITY = 0.02, 0.8  # extent of that box: linear; log color without brightness
 START_GRID = 32  # points along a side of the box
 MAX_BEND = 0.3  # length of the vector added to a unit normal: 17 degrees
 BEND_GRIDS = (8, 16, 32, 64)  # finer than the material's, which must not explain errors of the normals
@@ -42,15 +39,13 @@ class Unknowns:
     """Variables of the optimization, in a frame in which the object fills the box [-1, 1]^3.
 
     sdf: ``(X, Y, Z)`` signed distance, negative inside.  material: grids ``(n, n, n, 5)`` over the box, changes of
-    logits.  finish: ``(n, n, n, 2)`` over base colors, changes of logits of roughness and metallic.  detail: ``(T, T,
-    3)`` over the atlas, changes of base color logits.  bend: grids ``(n, n, n, 3)`` over the box, added to the unit
-    shading normal.  light: maps ``(G, h, 2h, 3)`` of G lightings, changes of log radiance.  exposure: ``(V,)``
-    logarithms.  pose: ``(V, 6)``, a rotation vector [rad] and a translation in the camera's axes.
+    logits.  detail: ``(T, T, 3)`` over the atlas, changes of base color logits.  bend: grids ``(n, n, n, 3)`` over the
+    box, added to the unit shading normal.  light: maps ``(G, h, 2h, 3)`` of G lightings, changes of log radiance.
+    exposure: ``(V,)`` logarithms.  pose: ``(V, 6)``, a rotation vector [rad] and a translation in the camera's axes.
     """
 
     sdf: Tensor
     material: list[Tensor]
-    finish: Tensor
     detail: Tensor
     bend: list[Tensor]
     light: list[Tensor]
@@ -64,7 +59,6 @@ class Unknowns:
         return cls(
             sdf.clone(),
             [zeros(n, n, n, 5) for n in MATERIAL_GRIDS],
-            zeros(COLOR_GRID, COLOR_GRID, COLOR_GRID, 2),
             zeros(texels, texels, 3),
             [zeros(n, n, n, 3) for n in BEND_GRIDS],
             [zeros(lights, n, 2 * n, 3) for n in LIGHT_MAPS],
@@ -118,25 +112,11 @@ def material_of(logits: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return values[:, :3], MIN_ROUGHNESS + (MAX_ROUGHNESS - MIN_ROUGHNESS) * values[:, 3], values[:, 4]
 
 
-def changed_logits(unknowns: Unknowns, logits: Tensor, position: Tensor, detail: Tensor | float = 0.0) -> Tensor:
-    """Logits ``(N, 5)`` of the fitted material at ``position (N, 3)``, where those of the start are ``logits (N, 5)``.
-
-    detail: ``(N, 3)``, of the base color.  Roughness and metallic change by the coarse grids and by a grid over base
-    colors, because points of one color mostly have one material; this grid gives the base color no gradient.
-    """
+def material_change(unknowns: Unknowns, position: Tensor) -> Tensor:
+    """Change of the logits ``(N, 5)`` at ``position (N, 3)``; roughness and metallic from the coarse grids only."""
     both = space_field(unknowns.material[:FINISH_GRIDS], position)
     fine = space_field([grid[..., :3] for grid in unknowns.material[FINISH_GRIDS:]], position)
-    color = logits[:, :3] + both[:, :3] + fine + detail
-    finish = space_field([unknowns.finish], _color_coordinates(color.detach().sigmoid()))
-    return torch.cat([color, logits[:, 3:] + both[:, 3:] + finish], 1)
-
-
-def _color_coordinates(color: Tensor) -> Tensor:
-    """Log brightness and two log chromaticities of linear ``color (N, 3)``, in [-1, 1]."""
-    logs = color.clamp(min=DARKEST_COLOR).log()
-    brightness = logs.mean(1, keepdim=True)
-    chromaticity = (logs - brightness)[:, [0, 2]] / MAX_CHROMATICITY
-    return torch.cat([1.0 - 2.0 * brightness / math.log(DARKEST_COLOR), chromaticity], 1).clamp(-1.0, 1.0)
+    return both + torch.cat([fine, torch.zeros_like(both[:, 3:])], 1)
 
 
 def bent(unknowns: Unknowns, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:

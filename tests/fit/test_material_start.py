@@ -13,17 +13,23 @@ from reli3d.fit.losses import Weights
 from reli3d.fit.maps import FixedSurface
 from reli3d.fit.material_start import best_material_start
 from reli3d.fit.unknowns import Start, Unknowns
+from reli3d.render.environment import Environment
 from tests.support import small_scene
 
 VIEWS, SIZE, STEPS = 12, 24, 400
 
 
+def lamps() -> Environment:
+    radiance = 0.3 * small_scene.sky().radiance
+    for row, column in ((3, 5), (5, 18), (8, 27)):
+        radiance[row, column] = 40.0
+    return Environment(radiance)
+
+
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
 def test_a_glossy_dielectric_is_found_and_a_metal_is_not_taken_for_one(metallic):
     true = small_scene.two_colored(small_scene.ball())
-    true = replace(
-        true, environment=small_scene.lamps(), textures=replace(true.textures, roughness=0.25, metallic=metallic)
-    )
+    true = replace(true, environment=lamps(), textures=replace(true.textures, roughness=0.25, metallic=metallic))
     images = InputImages.of(small_scene.input_views(true, VIEWS, SIZE))
     textures = replace(true.textures, roughness=0.7, metallic=0.5)
     start = replace(true, environment=small_scene.ball().environment, textures=textures)

@@ -290,7 +290,7 @@ def test_maps_move_to_another_surface():
 
 def test_large_textures_are_baked_in_parts(monkeypatch):
     rows = []
-    for name in ("nearest_hits", "changed_logits"):
+    for name in ("nearest_hits", "material_change"):
         run = getattr(transfer, name)
         monkeypatch.setattr(transfer, name, lambda a, at, *rest, run=run: rows.append(len(at)) or run(a, at, *rest))
     moved = transfer_textures(small_scene.ball().mesh, small_scene.ball(), 768)

@@ -39,14 +39,6 @@ def sky() -> Environment:
     return Environment((row * column * torch.tensor([0.9, 1.0, 1.1])).contiguous())
 
 
-def lamps() -> Environment:
-    """Three bright texels and a dim sky: highlights show roughness."""
-    radiance = 0.3 * sky().radiance
-    for row, column in ((3, 5), (5, 18), (8, 27)):
-        radiance[row, column] = 40.0
-    return Environment(radiance)
-
-
 def two_colored(asset: Asset) -> Asset:
     """The ball with a red and a green half and the sky around it."""
 
