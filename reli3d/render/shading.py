@@ -107,14 +107,14 @@ def shade(
 ) -> Tensor:
     """Reflected radiance ``(N, 3)`` of surface points towards ``wo`` under ``environment``; linear Rec. 709.
 
-    wo: ``(N, 3)`` or ``(3,)`` unit, world frame, to the camera.  Surfaces are two-sided; shading normals that face away
-    from ``wo`` are adjusted.  scene: occluders; None: no shadows.  pixels: ``(N,)`` int32, seeds each point's samples
-    with ``options.seed``; None: the row number.  rotations: ``(N, 3, 3)``, from the environment's axes to those of the
-    points, without gradient; None: they are the same.  Non-finite inputs give NaN.
+    wo: ``(N, 3)`` or ``(3,)`` unit, to the camera.  Surfaces are two-sided; shading normals that face away from ``wo``
+    are adjusted.  scene: occluders; None: no shadows.  pixels: ``(N,)`` int32, seeds with ``options.seed`` each point's
+    samples; None: the row number.  rotations: ``(N, 3, 3)``, from the environment's axes to those of the points; None:
+    the same axes.  Non-finite inputs give NaN.
 
-    First derivatives reach normal (only the tangential component is meaningful: optimize ``normalize(x)``), base_color,
-    roughness, metallic and the environment's texels, at constant directions, densities, MIS weights and visibility.
-    Bitwise reproducible.  Raises TypeError (type, dtype) or ValueError (shape, device).  Source: Veach and Guibas 1995.
+    First derivatives (detached sampling) reach normal (the tangential component: optimize ``normalize(x)``),
+    base_color, roughness, metallic and the environment's texels.  Bitwise reproducible.  Raises TypeError (type, dtype)
+    or ValueError (shape, device).  Source: Veach and Guibas 1995.
 
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
     >>> radiance = reli3d.shade(points, wo, reli3d.Environment.constant(torch.ones(3)))

@@ -144,14 +144,14 @@ def test_lighting_in_a_frame_of_its_own_is_that_of_turned_points_and_occluders(d
     pixels = torch.arange(count, dtype=torch.int32, device=device)
     scene, light = RayScene(vertices, faces), Environment(radiance)
     together = shade(points, eye, light, scene=scene, rotations=turns[which])
-    apart = torch.zeros_like(together)
+    separate = torch.zeros_like(together)
     for k, turn in enumerate(turns):
         rows = which == k
         given = at(*(v[rows] @ turn for v in (place, tilted, still, wo)), *(v[rows] for v in rest))
         scene_k = RayScene(vertices @ turn, faces)
-        apart = apart.index_put((rows,), shade(*given, light, scene=scene_k, pixels=pixels[rows]))
+        separate = separate.index_put((rows,), shade(*given, light, scene=scene_k, pixels=pixels[rows]))
     ignored = shade(points, eye, light, scene=scene)
-    for got in (together, apart, ignored):
+    for got in (together, separate, ignored):
         results.append([got.detach(), *torch.autograd.grad((got * weight).sum(), inputs, retain_graph=True)])
     for got, expected, other in zip(*results, strict=True):
         bound = 1e-3 * float(expected.abs().mean())  # rounding of directions; a few shadow rays pass edges differently
