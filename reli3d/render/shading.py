@@ -113,8 +113,8 @@ def shade(
     the same axes.  Non-finite inputs give NaN.
 
     First derivatives (detached sampling) reach normal (the tangential component: optimize ``normalize(x)``),
-    base_color, roughness, metallic and the environment's texels.  Bitwise reproducible.  Raises TypeError (type, dtype)
-    or ValueError (shape, device).  Source: Veach and Guibas 1995.
+    base_color, roughness, metallic and the environment's texels.  Bitwise reproducible.  Raises TypeError or
+    ValueError.  Source: Veach and Guibas 1995.
 
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
     >>> radiance = reli3d.shade(points, wo, reli3d.Environment.constant(torch.ones(3)))
