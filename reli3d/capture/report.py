@@ -67,7 +67,7 @@ def check(report: CaptureReport) -> None:
         (
             report.epipolar_fit >= LEAST_FIT,
             f"{100 * report.epipolar_fit:.0f} % of the matches on the object fit the cameras, at least "
-            f"{100 * LEAST_FIT:.0f} % expected: the object was moved relative to its surroundings",
+            f"{100 * LEAST_FIT:.0f} % expected: the object, or something around it, moved",
         ),
         (
             report.gap < WIDEST_GAP,
