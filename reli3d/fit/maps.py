@@ -174,6 +174,7 @@ def fit_maps(
     pixels = traced(data, scene, seed) if pixels is None else pixels
     count = len(pixels.order)
     if count == 0:
+        budget.counts[part.name] = 0
         return
     names = ("light", "exposure", "material", *(("detail", "bend") if detail else ()))
     groups = []
@@ -206,5 +207,5 @@ def fit_maps(
         budget.record(part.name, step, float(loss.detach()))
     for group in optimizer.param_groups:
         group["params"][0].requires_grad_(False)
-    if not settled:  # interrupted
+    if not settled and budget.counts[part.name]:  # interrupted
         unknowns.reset_bend()

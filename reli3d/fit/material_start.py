@@ -75,17 +75,17 @@ def best_material_start(
     for grid in plain.material:
         grid[..., 3:] = 0.0
     scene = RayScene(data.asset.mesh.vertices, data.asset.mesh.faces)
-    pixels = [traced(replace(data, used=views), scene, seed) for views in (data.used, held)]
+    pixels = [traced(replace(data, used=views), scene, seed) for views in (data.used, held) if views]
     fits, errors = {"start": (unknowns, data)}, dict.fromkeys(("start", *TRIAL_METALLIC), math.inf)
     for name in errors:
         if name in TRIAL_METALLIC:
             fits[name] = deepcopy(plain), with_metallic(data, TRIAL_METALLIC[name])
         part = Part(f"trial of {name}", budget.used() + TRIAL, MIN_STEPS)
-        fitted, check = (some.with_maps(fits[name][1].asset) for some in pixels)
-        fit_maps(*fits[name], weights, budget, part, seed=seed, pixels=fitted)
+        own = [some.with_maps(fits[name][1].asset) for some in pixels]
+        fit_maps(*fits[name], weights, budget, part, seed=seed, pixels=own[0])
         if budget.counts[part.name] < MIN_STEPS:
             break
-        errors[name] = sum(image_error(*fits[name], of_views, scene, seed) for of_views in (fitted, check))
+        errors[name] = sum(image_error(*fits[name], of_views, scene, seed) for of_views in own)
     if errors["dielectric"] < errors["metal"]:
         errors["dielectric"] /= PREFERENCE
     errors["metal"] /= METAL_GAIN

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from reli3d._bridge import full_precision, load_modules
+from reli3d._bridge import full_precision, load_modules, present
 from reli3d.fit import losses
 from reli3d.fit.bounce import gathered
 from reli3d.fit.budget import Budget, Part
@@ -22,7 +23,7 @@ from reli3d.fit.material_start import best_material_start
 from reli3d.fit.shape import ShapeData, empty, finished, fit_shape, start_grid
 from reli3d.fit.transfer import transfer_textures
 from reli3d.fit.unknowns import START_GRID, Start, Unknowns, corrected, filled_grid
-from reli3d.geometry.mesh import watertight
+from reli3d.geometry.mesh import Mesh, watertight
 from reli3d.kernels import cache, flexicubes_adjoint, shade_adjoint  # noqa: F401 # they are compiled before the fit
 from reli3d.render.asset import Asset
 
@@ -93,9 +94,17 @@ class Refinement:
         }
 
 
-def held_out(count: int) -> tuple[int, ...]:
-    """Indices of the held-out views: none of fewer than 3 views, one of fewer than 12, otherwise two."""
-    return () if count < 3 else (count // 2,) if count < 12 else (count // 3, 2 * count // 3)
+def held_out(groups: Sequence[int]) -> tuple[int, ...]:
+    """Indices of the held-out views: none of fewer than 3 views, one of fewer than 12, otherwise two.
+
+    groups: index of the lighting per view; one view of each lighting is not held out.
+    """
+    count, held = len(groups), list[int]()
+    for view in () if count < 3 else (count // 2,) if count < 12 else (count // 3, 2 * count // 3):
+        fitted = Counter(group for v, group in enumerate(groups) if v not in held)
+        free = [v for v, group in enumerate(groups) if v not in held and fitted[group] > 1]
+        held += [min(free, key=lambda v: abs(v - view))] if free else []
+    return tuple(held)
 
 
 @torch.inference_mode(False)
@@ -119,7 +128,7 @@ def refine(
 
     The colors of :func:`held_out` views are not fitted.  :func:`~reli3d.fit.choice.chosen` selects what is kept.
     Nothing has gradients.  Raises TypeError or ValueError for mismatched shapes or devices, an invalid ``light`` or
-    budget, or an asset without environment, textures, normals, UV or faces, or open and with UV outside [0, 1].
+    budget, or an asset without environment, textures, normals, UV or faces.
     """
     images = InputImages.of(views, options.light)
     _check_asset(asset, images)
@@ -128,12 +137,14 @@ def refine(
     if not cache.compiled(kernels, device.type):  # it takes up to half a minute, which is not part of the budget
         load_modules(kernels, device)
     budget = Budget(seconds, steps, bar, interrupt)
-    held = held_out(len(images))
+    held = held_out(images.light_group)
     used = [v for v in range(len(images)) if v not in held]
     low, high = asset.mesh.vertices.detach().aminmax(dim=0)
     shift, scale = (low + high) / 2, 2.0 / float((high - low).max())
     first, near = _moved(asset.detach(), shift, scale), images.moved(shift, scale)
-    if first.mesh.tangents is None:
+    if _tiled(first.mesh):
+        first = transfer_textures(first.mesh, first, _atlas_size(first))
+    elif first.mesh.tangents is None:
         first = replace(first, mesh=first.mesh.with_tangents())
     received = gathered(first.mesh, near.select(used), seed=options.seed)
     before = view_errors(first, received, near)
@@ -168,7 +179,7 @@ def refine(
 
 def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: list[str]) -> Fitted:
     first, images, used, seed = data.asset, data.images, data.used, options.seed
-    start, weights, texels = data.start, options.weights, max(MIN_ATLAS_TEXELS, first.textures.size)
+    start, weights, texels = data.start, options.weights, _atlas_size(first)
     closed = watertight(first.mesh)
     sdf = first.mesh.vertices.new_ones(2, 2, 2)  # unused placeholder: an open surface has no signed distance
     if closed:
@@ -199,6 +210,16 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
     return Fitted(first, surface, data.received, start, unknowns, images, data.asset)
 
 
+def _tiled(mesh: Mesh) -> bool:
+    """Whether UV leave [0, 1], so that texels may be shared by several places of the surface."""
+    low, high = present("mesh.uv", mesh.uv).detach().aminmax()
+    return float(low) < -UV_TOLERANCE or float(high) > 1.0 + UV_TOLERANCE
+
+
+def _atlas_size(asset: Asset) -> int:
+    return max(MIN_ATLAS_TEXELS, asset.textures.size)
+
+
 def _check_asset(asset: Asset, images: InputImages) -> None:
     if asset.environment is None:
         raise ValueError("asset.environment: expected an environment to start from, got None")
@@ -206,10 +227,6 @@ def _check_asset(asset: Asset, images: InputImages) -> None:
         raise ValueError("asset.textures: expected textures to start from, got None")
     if asset.mesh.uv is None or asset.mesh.normals is None or not len(asset.mesh.faces):
         raise ValueError("asset.mesh: expected faces with normals and uv, got none; see reli3d.unwrap")
-    low, high = (float(v) for v in asset.mesh.uv.detach().aminmax())
-    if (low < -UV_TOLERANCE or high > 1.0 + UV_TOLERANCE) and not watertight(asset.mesh):
-        got = f"[{low:.3g}, {high:.3g}]; see reli3d.unwrap"
-        raise ValueError(f"asset.mesh.uv: expected values in [0, 1] on an open surface, got {got}")
     if asset.mesh.vertices.device != images.color.device:
         raise ValueError(f"views: expected device {asset.mesh.vertices.device}, got {images.color.device}")
 

@@ -40,6 +40,16 @@ def test_a_glossy_dielectric_is_found_and_a_metal_is_not_taken_for_one(metallic)
     assert (float(best.asset.textures.metallic.mean()) < 0.1) == (metallic == 0.0)
 
 
+@pytest.mark.parametrize("held", [[0], []])
+def test_without_pixels_inside_the_masks_the_start_is_kept(held):
+    first = small_scene.ball()
+    views = small_scene.input_views(first, 2, 8)
+    images = InputImages.of(replace(views, masks=torch.zeros_like(views.masks)))
+    unknowns = Unknowns.zero(torch.ones(2, 2, 2), 2, small_scene.TEXELS)
+    data = FixedSurface(Start.of(first), first, gathered(first.mesh, images, seed=0), images, [1])
+    assert best_material_start(unknowns, data, held, Weights(), Budget(steps=STEPS), seed=0) == (unknowns, data)
+
+
 @pytest.mark.parametrize(
     "errors, metallic",
     [((1.0, 0.98, 1.1), 0.5), ((1.0, 0.95, 1.1), 0.95), ((1.0, 1.06, 1.04), 0.05), ((1.0, 1.03, 1.04), 0.5)],

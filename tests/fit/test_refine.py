@@ -13,10 +13,12 @@ from torch.nn.functional import normalize
 from reli3d._bridge import mapped
 from reli3d.fit import refine as fit
 from reli3d.fit import transfer
+from reli3d.fit.bounce import gathered
 from reli3d.fit.budget import Budget, Part
 from reli3d.fit.choice import PSNR_TOLERANCE_DB, Fitted, Parts
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import LIGHT_PRIOR_VIEWS, Weights, agreement, display_error, hue_drift, palette, priors
+from reli3d.fit.maps import FixedSurface, fit_maps
 from reli3d.fit.transfer import transfer_textures
 from reli3d.fit.unknowns import Start, Unknowns, corrected
 from reli3d.geometry.camera import project
@@ -175,12 +177,43 @@ def test_an_open_surface_keeps_its_shape(start, views):
     assert torch.allclose(result.asset.mesh.vertices, start.mesh.vertices, atol=1e-5)
 
 
+def test_a_repeated_texture_is_fitted_where_it_is_seen(start, views):
+    """Texels that show two places of the surface get two colors."""
+    tiled = replace(start, mesh=replace(start.mesh, faces=start.mesh.faces[:-40], uv=2.0 * start.mesh.uv))
+    result = fit.refine(tiled, views, steps=40)
+    red, green = half_colors(result.asset)
+    assert red[0] > 1.5 * red[1] and green[1] > 1.2 * green[0]
+    assert float(result.asset.mesh.uv.min()) >= 0.0 and float(result.asset.mesh.uv.max()) <= 1.0
+
+
+@pytest.mark.parametrize(
+    "groups, held",
+    [
+        ((0, 0), ()),
+        ((0,) * 11, (5,)),
+        ((0,) * 12, (4, 8)),
+        ((0, 1, 2), ()),
+        ((0, 1, 0), (0,)),
+        ((0, 0, 0, 0, 1, 1, 2, 2, 3, 4, 4, 4), (4, 7)),
+        ((0, 0, *range(1, 11)), (1,)),
+    ],
+)
+def test_a_view_of_each_lighting_is_fitted(groups, held):
+    assert fit.held_out(groups) == held
+
+
+def test_without_a_step_a_fitted_bend_is_kept(start, views):
+    images, unknowns = InputImages.of(views), Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
+    unknowns.bend[0][:] = 0.1
+    data = FixedSurface(Start.of(start), start, gathered(start.mesh, images, seed=0), images, list(range(VIEWS)))
+    fit_maps(unknowns, data, Weights(), Budget(steps=9, interrupt=lambda: True), Part("maps", 1.0), seed=0)
+    assert bool((unknowns.bend[0] == 0.1).all())
+
+
 def test_what_does_not_fit_together_is_refused(start, views):
-    tiled = replace(start.mesh, faces=start.mesh.faces[:-40], uv=2.0 * start.mesh.uv)
     for call, message in (
         (lambda: fit.refine(replace(start, environment=None), views, steps=1), "environment: expected an environment"),
         (lambda: fit.refine(replace(start, textures=None), views, steps=1), "asset.textures: expected textures"),
-        (lambda: fit.refine(replace(start, mesh=tiled), views, steps=1), "asset.mesh.uv: expected .* on an open surf"),
         (lambda: InputImages.of(replace(views, masks=views.masks[:, 1:])), "masks: expected"),
         (lambda: fit.refine(start, views), "seconds, steps: expected one"),
         (lambda: Budget(steps=0), "steps: expected at least 1"),
