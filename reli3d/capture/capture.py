@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from reli3d.capture.consistency import masked_views
 from reli3d.capture.mapping import View, map_photos
@@ -33,9 +34,11 @@ from reli3d.views.file_names import images_in
 from reli3d.views.masks import mask_values
 from reli3d.views.missing_cameras import PHOTOGRAPHS
 
-RESULT_FILES = ("images", "masks", "transforms.json", "capture.json", "capture.png")
+RESULT_FILES = ("images", "masks", "transforms.json", "capture.json", "capture.png", "asset")  # asset: of --infer
 MASK_METHODS = ("grabcut", "key", "rembg")
 MOST_VIEWS = 60  # of the object folder; more are thinned by the distance between their cameras
+CUT_OFF = "the object is cut off by the image's border"
+UNDISTORTED = "undistorted by reli3d capture"  # comment in the masks of an object folder
 OUTLIER_AGREEMENT = 0.8  # of the median: a view whose mask the hull fills less is left out
 
 
@@ -142,7 +145,7 @@ def _check_output(source: Path, output: Path, masks: Path | None) -> None:
     if output.resolve() in (source.resolve(), *source.resolve().parents) and (output / "capture.json").exists():
         raise InputError(output, "expected a folder without the images that are read, got theirs; give another")
     if masks and output.resolve() in (masks.resolve(), *masks.resolve().parents):
-        raise InputError(masks, "expected masks outside the output, which is replaced; copy them to another folder")
+        raise InputError(masks, "expected masks outside the output, which is replaced; move your own to another folder")
     if output.is_dir() and any(output.iterdir()) and not (output / "capture.json").exists():
         raise InputError(output, "expected an empty folder or an earlier capture, got other files; give another")
 
@@ -197,6 +200,9 @@ def _given_mask(folder: Path, photo: Photo) -> np.ndarray | None:
     if len(files) > 1:
         raise InputError(folder, f"expected one mask of {printable(photo.name)}, got {files[0].name}, {files[1].name}")
     bitmap = decode_image(files[0], upright=True)
+    if bitmap.info.get("Comment") == UNDISTORTED:
+        fix = "edit those in place and run reli3d-infer, or segment the photographs themselves"
+        raise InputError(files[0], f"expected a mask of the photograph, got one of the undistorted image; {fix}")
     coverage = unit(mask_values(files[0], bitmap, []))  # the note on values below white is left out
     mask = np.rint(255 * coverage).astype(np.uint8)
     (width, height), (w, h) = photo.size, bitmap.size
@@ -215,7 +221,7 @@ def _consistent_views(source: Path, final: Segmented, report: CaptureReport) -> 
             report.left_out[view.photo.name] = "no mask"
     for view in views:
         if touches_border(final.masks[view.photo.name]):
-            report.left_out[view.photo.name] = "the object is cut off by the image's border"
+            report.left_out[view.photo.name] = CUT_OFF
     views = [v for v in views if v.photo.name not in report.left_out]
     while len(views) >= FEWEST:
         filled = np.array(agreement(masked_views(views, final.masks))[1])
@@ -229,7 +235,7 @@ def _consistent_views(source: Path, final: Segmented, report: CaptureReport) -> 
         fix = "take sharper images, or give --masks"
         if report.epipolar_fit < LEAST_FIT:
             fix = "something else moves: photograph the object before a background at rest, or give --masks"
-        elif any("border" in reason for reason in report.left_out.values()):
+        elif 2 * list(report.left_out.values()).count(CUT_OFF) >= len(report.left_out):
             fix = "step back: the whole object must be in the image"
         elif report.registered < LEAST_REGISTERED * report.images:
             fix = SMALL_STEPS
@@ -288,13 +294,15 @@ def _write(
         frames, thumbnails = [], []
         for name in ("images", "masks"):
             (work / name).mkdir()
+        comment = PngInfo()
+        comment.add_text("Comment", UNDISTORTED)
         for k, view in enumerate(views):
             name = view.photo.name
             progress("writing", k, len(views))
             image = view.undistorted(view.photo.pixels)
             mask = view.undistorted(masks[view.photo.name])
             Image.fromarray(image).save(work / "images" / f"{name}.jpg", quality=95, subsampling=0)
-            Image.fromarray(mask).save(work / "masks" / f"{name}.png")
+            Image.fromarray(mask).save(work / "masks" / f"{name}.png", pnginfo=comment)
             pose = view.c2w
             pose[:3, :3] = frame.rotation @ pose[:3, :3]
             pose[:3, 3] = frame.apply(view.eye)

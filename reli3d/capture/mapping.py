@@ -27,7 +27,6 @@ LOW_PEAK = 0.003  # SIFT's peak threshold: with its default, 0.0067, a dark obje
 MATCH_RATIO = 0.85  # of nearest to second-nearest descriptor: with 0.8 a dark object has 0.75 times the points
 PAIR_TRIALS = 1000  # of RANSAC for a pair of images: most do not overlap; COLMAP's 10,000 make matching 4 times slower
 ENOUGH = 0.8  # fraction of the images whose registration needs no retry
-EXHAUSTIVE = 100  # images up to which each is matched with each
 SEED = 0
 DEFAULT_FOCAL = 1.2  # of the longer side, where EXIF has none: a phone's main camera, and COLMAP's own default
 LENS_STEPS = 8  # fixed-point iterations that undo the distortion of a lens
@@ -234,12 +233,7 @@ def _mapped(photos, masks, known: Map | None, work: Path, side: int, relaxed: bo
     matching.sift.max_ratio, verification.ransac.max_num_trials = MATCH_RATIO, PAIR_TRIALS
     verification.ransac.random_seed = SEED  # else that of a pair depends on the thread that it meets
     progress("matching", 0, 1)
-    if len(photos) <= EXHAUSTIVE:
-        pycolmap.match_exhaustive(database, matching, verification_options=verification)
-    else:
-        pairing = pycolmap.SequentialPairingOptions()
-        pairing.overlap, pairing.quadratic_overlap = 15, True  # offsets of 1 to 15, 16, 32, ...: these close loops
-        pycolmap.match_sequential(database, matching, pairing, verification)
+    pycolmap.match_exhaustive(database, matching, verification_options=verification)
     options = pycolmap.IncrementalPipelineOptions(min_model_size=3, random_seed=SEED, extract_colors=False)
     options.num_threads = 1  # else the first pair of images depends on the threads, where few pairs are good
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not known

@@ -17,13 +17,14 @@ from reli3d.errors import InputError, shown
 from reli3d.io.files import file_size
 from reli3d.io.images import FORMATS, check_depth, in_srgb
 from reli3d.views.masks import alpha_values
-from reli3d.views.missing_cameras import PHOTOGRAPHS, VIDEOS
+from reli3d.views.missing_cameras import PHOTOGRAPHS, VIDEOS, capture_command
 
 LONGEST_SIDE = 2000  # pixels of a photograph that is kept
 FRAME_COUNT = 60  # frames taken from a video
 MOST_PHOTOS = 120  # of a folder: of more every second, third, ... is read
 FEWEST = 8  # photographs, below which no closed shape can be expected
 MAX_PIXELS = 1 << 27
+TOO_LARGE = f"expected at most {MAX_PIXELS / 1e6:.0f} million pixels"
 UNSPECIFIED, HD = 2, 720  # FFmpeg's number of an unknown color space; rows of high definition
 HDR_TRANSFERS = (16, 18)  # PQ and HLG, as FFmpeg numbers transfer functions
 WHOLE_VIDEO = 0.9  # fraction of the frames that a file announces, below which it is cut off
@@ -63,6 +64,8 @@ def read_photos(source: Path, progress: Progress) -> tuple[list[Photo], list[str
     else:
         file_size(source)
         raise InputError(source, "expected a folder of photographs or a video (mp4, mov); check the path")
+    if not photos and (error := capture_command(source, "a folder with photographs, got {}")):
+        raise error
     if len(photos) < FEWEST:
         raise InputError(
             source, f"expected at least {FEWEST} photographs, got {len(photos)}; take 30 to 70 all around the object"
@@ -84,7 +87,10 @@ def read_photos(source: Path, progress: Progress) -> tuple[list[Photo], list[str
 
 
 def _read_folder(folder: Path, progress: Progress) -> tuple[list[Photo], list[str]]:
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTOGRAPHS and not p.name.startswith("."))
+    try:
+        files = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTOGRAPHS and not p.name.startswith("."))
+    except OSError as error:
+        raise InputError(folder, f"cannot be read ({error.strerror}); check its permissions") from None
     if not files and (folder / "images").is_dir():
         return _read_folder(folder / "images", progress)
     if any(p.suffix.lower() in (".heic", ".heif") for p in files):
@@ -122,7 +128,7 @@ def _read_photo(path: Path, name: str, notes: list[str]) -> Photo:
             image = Image.open(path, formats=formats)
         with image:
             if image.width * image.height > MAX_PIXELS:
-                raise InputError(path, f"expected at most {MAX_PIXELS} pixels, got {image.width} x {image.height}")
+                raise InputError(path, f"{TOO_LARGE}, got {image.width} x {image.height}; save it smaller")
             exif = image.getexif()
             tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
             stored = image.size
@@ -140,6 +146,8 @@ def _read_photo(path: Path, name: str, notes: list[str]) -> Photo:
             upright = upright.convert("RGB")
     except InputError:
         raise
+    except Image.DecompressionBombError:
+        raise InputError(path, f"{TOO_LARGE}; save it smaller") from None
     except Exception as error:  # decoders raise almost anything on a broken file
         raise InputError(path, f"cannot be decoded ({shown(str(error))}); leave it out or save it again") from None
     longest = max(upright.size)

@@ -59,19 +59,20 @@ def check(report: CaptureReport) -> None:
     checks = (
         (
             registered >= LEAST_REGISTERED,
-            f"{100 * registered:.0f} % of the images registered, at least {100 * LEAST_REGISTERED:.0f} % expected; "
+            f"{report.registered} of {report.images} images registered, at least {100 * LEAST_REGISTERED:.0f} % "
+            "expected; "
             + (f"{report.separate} others fit together (a second object, or a gap); " if report.separate else "")
             + SMALL_STEPS,
         ),
         (error < MAX_MEAN_ERROR, f"reprojection error {error} px, below {MAX_MEAN_ERROR:.0f} expected"),
         (
             report.epipolar_fit >= LEAST_FIT,
-            f"{100 * report.epipolar_fit:.0f} % of the matches on the object fit the cameras, at least "
+            f"{100 * report.epipolar_fit:.1f} % of the matches on the object fit the cameras, at least "
             f"{100 * LEAST_FIT:.0f} % expected: the object, or something around it, moved",
         ),
         (
             report.gap < WIDEST_GAP,
-            f"no view within a sector of {math.floor(report.gap)} degrees, at most {WIDEST_GAP:.0f} expected; "
+            f"no view within a sector of {report.gap:.1f} degrees, less than {WIDEST_GAP:.0f} expected; "
             "add images from there",
         ),
         (
@@ -81,12 +82,12 @@ def check(report: CaptureReport) -> None:
         ),
         (
             report.agreement >= LEAST_AGREEMENT,
-            f"the visual hull fills {100 * report.agreement:.0f} % of a mask, at least {100 * LEAST_AGREEMENT:.0f} % "
+            f"the visual hull fills {100 * report.agreement:.1f} % of a mask, at least {100 * LEAST_AGREEMENT:.0f} % "
             "expected: masks lack a part of the object; give --masks or --mask-method rembg",
         ),
         (
             report.mask_fraction >= LEAST_MASK,
-            f"the object covers {100 * report.mask_fraction:.1f} % of an image, at least {100 * LEAST_MASK:.0f} % "
+            f"the object covers {100 * report.mask_fraction:.2f} % of an image, at least {100 * LEAST_MASK:.0f} % "
             "expected",
         ),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -11,7 +12,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from reli3d.capture.capture import capture
+from reli3d.capture.capture import CaptureOptions, capture
 from reli3d.capture.mapping import map_photos
 from reli3d.capture.photos import read_photos
 from reli3d.errors import InputError
@@ -73,7 +74,11 @@ def test_cameras_are_those_of_the_scene(ground_truth, captured):
 @pytest.mark.slow
 def test_two_runs_write_equal_files(ground_truth, captured, tmp_path):
     _, folder = captured
+    (tmp_path / "object" / "asset").mkdir(parents=True)  # of an earlier capture
+    for name in ("capture.json", "asset/mesh.glb"):
+        (tmp_path / "object" / name).touch()
     capture(ground_truth.write(tmp_path / "photographs"), tmp_path / "object")
+    assert not (tmp_path / "object" / "asset").exists()
     files = [p.relative_to(folder) for p in sorted(folder.rglob("*")) if p.is_file()]
     assert len(files) > 30
     assert all((folder / p).read_bytes() == (tmp_path / "object" / p).read_bytes() for p in files)
@@ -225,3 +230,11 @@ def test_the_folder_is_whole_and_is_replaced_only_if_it_is_a_capture(ground_trut
     with pytest.raises(InputError, match="empty folder or an earlier capture"):
         capture(folder / "images", tmp_path / "full")
     assert (tmp_path / "full" / "letter.txt").read_text() == "mine"
+
+
+def test_masks_of_undistorted_images_are_refused(ground_truth, captured, tmp_path):
+    masks = shutil.copytree(captured[1] / "masks", tmp_path / "masks")
+    options = CaptureOptions(masks=masks)
+    with pytest.raises(InputError, match="expected a mask of the photograph, got one of the undistorted image"):
+        capture(ground_truth.write(tmp_path / "photographs"), tmp_path / "object", options)
+    assert not (tmp_path / "object").exists()

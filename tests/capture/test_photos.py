@@ -151,6 +151,9 @@ def test_large_photographs_are_read_without_a_warning(tmp_path, monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(read_photos(tmp_path, quiet)[0]) == 8
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 320 * 240 // 2 - 1)  # Pillow refuses twice as many
+    with pytest.raises(InputError, match=r"0\.png: expected at most 134 million pixels; save it smaller"):
+        read_photos(tmp_path, quiet)
 
 
 @pytest.mark.parametrize(
@@ -329,6 +332,28 @@ def test_the_sharpest_frame_of_each_window_of_a_video_is_taken(tmp_path):
     path.write_bytes(data[: len(data) // 20])
     with pytest.raises(InputError, match=r"cannot be decoded \("):
         read_photos(path, quiet)
+
+
+def test_photographs_that_are_not_in_the_folder_itself_are_named(tmp_path):
+    (tmp_path / "mug.MOV").write_bytes(b"video")
+    with pytest.raises(InputError, match=rf"got 1 video; run: reli3d capture {tmp_path}/mug.MOV {tmp_path}-object"):
+        read_photos(tmp_path, quiet)
+    (tmp_path / "mug.MOV").unlink()
+    album = photographs(tmp_path / "100APPLE", map(textured, range(2)))
+    with pytest.raises(InputError, match=f"got 2 photographs in 100APPLE; run: reli3d capture {album} {album}-object"):
+        read_photos(tmp_path, quiet)
+    (tmp_path / "1.DNG").write_bytes(b"raw")
+    with pytest.raises(InputError, match=r"1\.DNG: expected JPEG, HEIC or PNG photographs; convert them"):
+        read_photos(tmp_path, quiet)
+
+
+def test_a_folder_that_cannot_be_listed_is_refused(tmp_path, monkeypatch):
+    def refuse(_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(InputError, match=r"cannot be read \(Permission denied\); check its permissions"):
+        read_photos(tmp_path, quiet)
 
 
 def test_inputs_that_are_no_capture_are_refused_in_one_line(tmp_path):

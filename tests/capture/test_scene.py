@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from reli3d.capture.masks import cleaned, key_mask, touches_border
-from reli3d.capture.report import widest_gap
+from reli3d.capture.report import CaptureReport, check, widest_gap
 from reli3d.capture.scene import find_plane
 from tests.support.mapped import overlap
 
@@ -76,3 +76,20 @@ def test_the_widest_gap_of_rings_of_cameras():
     assert widest_gap(ring(8, 0.0, 240.0)) == pytest.approx(360 - 210, abs=1.0)  # the last is at 210 degrees
     assert widest_gap(ring(60, 85.0)) == pytest.approx(2 * (85 - 45), abs=1.0)  # from above no side is seen
     assert widest_gap(np.concatenate([ring(12, 30.0), ring(12, -40.0)])) < 30
+
+
+@pytest.mark.parametrize(
+    "values, shown",
+    [
+        ({"registered": 43, "images": 54}, "43 of 54 images registered, at least 80 %"),
+        ({"gap": 60.4}, "a sector of 60.4 degrees, less than 60 "),
+        ({"agreement": 0.849}, "fills 84.9 % of a mask, at least 85 %"),
+        ({"mask_fraction": 0.0297}, "covers 2.97 % of an image, at least 3 %"),
+        ({"epipolar_fit": 0.798}, "79.8 % of the matches on the object fit the cameras, at least 80 %"),
+    ],
+)
+def test_a_failed_check_names_a_value_outside_its_bound(values, shown):
+    passing = {"images": 20, "registered": 20, "object_points": 500, "agreement": 0.95, "mask_fraction": 0.1}
+    report = CaptureReport(**{**passing, **values})
+    check(report)
+    assert len(report.failed) == 1 and shown in report.failed[0]
