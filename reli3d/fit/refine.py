@@ -201,7 +201,8 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
     else:
         notes.append("the surface is not closed, so only maps and lighting are fitted")
     surface, held = data.asset, [v for v in range(len(images)) if v not in used]
-    if len(images) >= MIN_VIEWS_FOR_TRIALS:
+    # Under lighting that moves with the camera, a metal may fit a dielectric's highlights (relighting -4 dB).
+    if len(images) >= MIN_VIEWS_FOR_TRIALS and images.light_frame != "camera":
         unknowns, data = best_material_start(unknowns, data, held, weights, budget, seed=seed)
         if data.asset is not surface:
             kind = "metal" if float(data.asset.textures.metallic.mean()) > 0.5 else "dielectric"

@@ -164,6 +164,20 @@ def test_every_textured_surface_is_a_start(start, views):
     assert result.parts.surface == 1.0 and not result.asset.mesh.vertices.requires_grad
 
 
+@pytest.mark.parametrize("light, trials", [("object", 1), ("turntable", 1), ("camera", 0)])
+def test_no_metal_is_tried_under_lighting_that_moves_with_the_camera(start, monkeypatch, light, trials):
+    called = []
+
+    def tried(unknowns, data, *_, **__):
+        called.append(light)
+        return unknowns, data
+
+    monkeypatch.setattr(fit, "best_material_start", tried)
+    views = small_scene.input_views(start, 12, 16)
+    fit.refine(start, views, steps=4, options=fit.RefineOptions(24, light=light))
+    assert len(called) == trials
+
+
 @pytest.mark.parametrize("interrupted", [True, False])
 def test_without_a_step_of_the_surface_it_stays(start, views, interrupted):
     result = fit.refine(start, views, steps=1, options=fit.RefineOptions(24), interrupt=lambda: interrupted)
