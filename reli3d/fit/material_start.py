@@ -20,10 +20,10 @@ TRIAL_ROUGHNESS = 0.25
 TRIAL_METALLIC = {"metal": 0.95, "dielectric": 0.05}
 TRIAL = 0.08  # fraction of the budget for each of the three fits; 0.12 for MIN_STEPS
 # Ratio to the start's error up to which the dielectric is preferred if it fits better than the metal: half metals fit
-# images of dielectrics almost as well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.06 for
+# images of dielectrics almost as well, by a base color and a lighting that are both wrong.  It is 0.95 to 1.04 for
 # glossy dielectrics, 1.10 to 1.29 for others; for a painted metal 0.99 to 1.02, where the metal does not always
 # fit better.
-PREFERENCE = 1.07
+PREFERENCE = 1.05
 # Ratio to the start's error below which the metal is taken.  It is 0.975 to 1.19 for objects of metal, whose starts are
 # metallic, and 0.98 for an object of plastic and steel, which the metal's fit makes metallic everywhere.
 METAL_GAIN = 0.97
