@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -47,7 +47,11 @@ from reli3d.views.folder import load_views
 from reli3d.views.normalize import FAR_DISTANCES, normalize
 from reli3d.views.published_views import BACKGROUNDS, background_shown, hero_first, placement_notes
 from reli3d.views.similarity import Similarity, output_frame
-from reli3d.views.views import Views, whole_views
+from reli3d.views.views import Views, crop_side, whole_views
+
+if TYPE_CHECKING:
+    from reli3d.fit.fine_detail import Crop
+    from reli3d.fit.refine import Refinement
 
 REFINED = 384  # pixels per side of the views that a refinement compares with
 LEAST_REFINED = 3  # views with the complete object from which a refinement leaves out the others
@@ -405,8 +409,35 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     Budget(seconds, steps)  # raises ValueError
     options = {"light": views.lighting, **options}
     views, options["light"] = _complete_views(views, options["light"])
-    batch = views.to(asset.mesh.vertices.device).resampled(REFINED, linear=True)
-    return fit.refine(asset, batch, seconds=seconds, steps=steps, options=fit.RefineOptions(**options)).asset
+    views = views.to(asset.mesh.vertices.device)
+    batch = views.resampled(REFINED, linear=True)
+    result = fit.refine(asset, batch, seconds=seconds, steps=steps, options=fit.RefineOptions(**options))
+    return _with_detail(result, _detail_crops(views, present("asset.textures", asset.textures).size))[0]
+
+
+def _detail_crops(views: Views, texels: int) -> list[Crop]:
+    """The views cropped as by ``Views.resampled``, at their own resolution or that of ``texels`` along a side."""
+    from reli3d.fit.fine_detail import Crop
+
+    crops = []
+    for k, mask in enumerate(views.masks):
+        one = views.select([k]).resampled(min(crop_side(mask), texels), linear=True)
+        color, cover = ((255.0 * values[0] + 0.5).to(torch.uint8) for values in (one.images, one.masks))
+        crops.append(Crop(color, cover, one.intrinsics[0]))
+    return crops
+
+
+def _with_detail(result: Refinement, crops: Sequence[Crop]) -> tuple[Asset, dict[str, Any], list[str]]:
+    """The refined asset with the detail of the photographs, its record and notes."""
+    from reli3d.fit.fine_detail import with_fine_detail
+
+    if not result.changed:
+        return result.asset, {}, []
+    asset, (before, after) = with_fine_detail(result.asset, crops, result.c2w, REFINED, result.held)
+    if asset is result.asset:
+        return asset, {}, []
+    note = f"refinement: texture detail of the photographs; error in held-out views {before:.3f} to {after:.3f}"
+    return asset, {"detail": {"error_before": before, "error_after": after}}, [note]
 
 
 def _complete_views(views: Views, light: str | Sequence) -> tuple[Views, str | Sequence]:
@@ -497,6 +528,7 @@ def reconstruct_folder(
                 note = f"refinement: {left_out} images that cut the object off are left out"
                 views = replace(views, notes=(*views.notes, note))
             batch, names = complete.resampled(REFINED, linear=True), complete.names
+            crops = _detail_crops(complete, options.texture_size)
             del complete
         del photographs  # 1 GB of 60 images of 1 MP
     if options.up == "y" and (axis := up_axis(views.c2w)) not in (None, "y"):
@@ -519,11 +551,14 @@ def reconstruct_folder(
             chosen = fit.RefineOptions(light=light, cameras=reading.cameras)
             budget: dict[str, Any] = dict(reading.budget or {})
             result = fit.refine(asset, batch, options=chosen, bar=True, interrupt=reading.interrupt, **budget)
-            compared = comparison(asset, result.asset, shown.to(model.device))
         progress.report(result.notes)
-        first, asset = asset if result.changed else None, result.asset
+        with watch.stage("detail"):
+            refined, detail, notes = _with_detail(result, [crop.to(model.device) for crop in crops])
+            compared = comparison(asset, refined, shown.to(model.device))
+        progress.report(notes)
+        first, asset = asset if result.changed else None, refined
         fitted = {"views": len(batch), "view_names": list(names), **budget}
-        record = {"refinement": fitted | result.record()}
+        record = {"refinement": fitted | result.record() | detail}
     with watch.stage("preview"):
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
         frames, moved = results.frame_record(placed.model_from_input, output, views.origin, options.up)

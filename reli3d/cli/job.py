@@ -21,7 +21,7 @@ from reli3d.pipeline import FolderOptions, Progress, ReconstructOptions, reconst
 
 STAGES = (
     "reading", "normalize", "prepare", "symmetry", "network", "surface", "textures", "light", "frame", "refine",
-    "preview", "writing",
+    "detail", "preview", "writing",
 )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.views.similarity import Similarity
 
 LEAST_WHOLE = 8  # views with the complete object; if there are as many, cropped views are left out
+PADDING = 0.08  # of a crop, on each side, of the mask's longer side
 MASK_EDGE = 0.1  # alpha from which a pixel counts into the bounding box: keeps hair and thin wires, drops codec noise
 
 
@@ -106,7 +107,7 @@ class Views(Movable):
         """
         return replace(self, c2w=similarity.of_cameras(self.c2w), object_box=None)
 
-    def resampled(self, size: int, *, crop: bool = True, padding: float = 0.08, linear: bool = False) -> ViewBatch:
+    def resampled(self, size: int, *, crop: bool = True, padding: float = PADDING, linear: bool = False) -> ViewBatch:
         """All views at ``size`` x ``size`` pixels, with the intrinsics of the new pixels.
 
         crop: crop to a square around the mask, with a margin of ``padding`` times its side on each side; beyond the
@@ -157,9 +158,15 @@ def whole_views(masks: Sequence[Tensor], least: int = LEAST_WHOLE) -> list[int]:
     return whole if len(whole) >= least else list(range(len(masks)))
 
 
+def crop_side(mask: Tensor, padding: float = PADDING) -> int:
+    """Side in pixels of the square to which :meth:`Views.resampled` crops an image with ``mask (H, W)``."""
+    x0, y0, x1, y1 = mask_box(mask)
+    return max(1, round(max(x1 - x0, y1 - y0) * (1.0 + 2.0 * padding)))
+
+
 def _window(mask: Tensor, padding: float) -> tuple[int, int, int, int]:
     x0, y0, x1, y1 = mask_box(mask)
-    side = max(1, round(max(x1 - x0, y1 - y0) * (1.0 + 2.0 * padding)))
+    side = crop_side(mask, padding)
     return (x0 + x1 - side) // 2, (y0 + y1 - side) // 2, side, side
 
 
