@@ -416,7 +416,7 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
 
 
 def _detail_crops(views: Views, texels: int) -> list[Crop]:
-    """The views cropped as by ``Views.resampled``, at their own resolution or that of ``texels`` along a side."""
+    """The views cropped as by ``Views.resampled``, at their own resolution but at most ``texels`` pixels per side."""
     from reli3d.fit.fine_detail import Crop
 
     crops = []
@@ -434,10 +434,12 @@ def _with_detail(result: Refinement, crops: Sequence[Crop]) -> tuple[Asset, dict
     if not result.changed:
         return result.asset, {}, []
     asset, (before, after) = with_fine_detail(result.asset, crops, result.c2w, REFINED, result.held)
-    if asset is result.asset:
-        return asset, {}, []
-    note = f"refinement: texture detail of the photographs; error in held-out views {before:.3f} to {after:.3f}"
-    return asset, {"detail": {"error_before": before, "error_after": after}}, [note]
+    added = asset is not result.asset
+    record = {"detail": {"added": added, "error_before": round(before, 4), "error_after": round(after, 4)}}
+    note = (
+        f"refinement: detail of the photographs in the base color, error in held-out views {before:.3f} to {after:.3f}"
+    )
+    return asset, record, [note] if added else []
 
 
 def _complete_views(views: Views, light: str | Sequence) -> tuple[Views, str | Sequence]:
@@ -554,8 +556,8 @@ def reconstruct_folder(
         progress.report(result.notes)
         with watch.stage("detail"):
             refined, detail, notes = _with_detail(result, [crop.to(model.device) for crop in crops])
-            compared = comparison(asset, refined, shown.to(model.device))
         progress.report(notes)
+        compared = comparison(asset, refined, shown.to(model.device))
         first, asset = asset if result.changed else None, refined
         fitted = {"views": len(batch), "view_names": list(names), **budget}
         record = {"refinement": fitted | result.record() | detail}

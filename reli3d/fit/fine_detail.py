@@ -10,23 +10,25 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, grid_sample, max_pool2d
 
-from reli3d._bridge import Movable, present
+from reli3d._bridge import Movable, full_precision, present
 from reli3d.fit.input_images import INSIDE_COVERAGE, SATURATED_LINEAR
-from reli3d.geometry.bake import bake
+from reli3d.geometry.bake import bake, rasterize_texels
 from reli3d.geometry.camera import Camera, project
-from reli3d.geometry.hits import interpolate
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import visible_from
 from reli3d.render.asset import Asset
 from reli3d.render.color import srgb_to_linear
-from reli3d.render.gbuffer import primary_hits, sample_texture
+from reli3d.render.gbuffer import primary_hits, surface_points
 
-CUTOFF = 1.5  # standard deviation of the low-pass filter, in pixels of the fit's images
-DARK = 0.02  # linear, added before the logarithm: darker pixels contain mostly noise
-DEPTH_EDGE = 0.01  # difference of depth of neighboring pixels, of the longest side, from which a pixel is left out
-COSINE_POWER = 2.0  # of the weight of a view at a texel: oblique views are blurred
-MIN_COSINE = 0.2  # between normal and direction to the eye, from which a view counts
-MIN_WEIGHT = 1e-6  # added to the sum of weights: no detail where no view counts
+MIN_RATIO = 1.25  # pixels of a crop along a pixel of the fit's images, from which there is detail to add
+LOW_PASS_SIGMA = 1.5  # of the filter that separates detail from shading, in pixels of the fit's images
+NOISE_FLOOR = 0.02  # linear, added before the logarithm: darker pixels contain mostly noise
+MAX_LOG_RATIO = 0.7  # a factor of 2; larger ones are highlights, shadows and wrong surfaces
+MAX_DEPTH_RANGE = 10.0  # pixel widths, of 3 by 3 pixels on one surface: planes tilted by 79 degrees
+MIN_FACING_COSINE = 0.2  # between normal and direction to the eye, from which a view counts
+COSINE_POWER = 2.0  # of the weight of a view: oblique views are blurred
+MIN_WEIGHT = 1e-6  # added to the sum of weights, far below that of one view: no detail where no view counts
+TEXELS_PER_CHUNK = 1 << 19
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,9 @@ class Crop(Movable):
         return Camera(c2w, self.intrinsics, self.mask.shape[1], self.mask.shape[0])
 
 
+@torch.inference_mode(False)
 @torch.no_grad()
+@full_precision
 def with_fine_detail(
     asset: Asset, crops: Sequence[Crop], c2w: Tensor, coarse: int, held: Sequence[int]
 ) -> tuple[Asset, tuple[float, float]]:
@@ -53,32 +57,35 @@ def with_fine_detail(
 
     A photograph is compared with the base color in its view times the local mean of the shading, the quotient of the
     low-pass filtered photograph and base color.  The logarithms of the ratios are averaged over the views at every
-    texel and added to the base color's.
+    texel and added to the base color's.  Views count by resolution and by the cosine of the viewing angle.
 
     asset: with textures, uv and normals.  c2w: ``(V, 4, 4)``, poses of the crops in its frame.  coarse: pixels per side
-    of the fit's images, which show the same crops.  held: indices of the crops that are not used.  Errors: root mean
-    square of the logarithms in the held-out crops; if it does not fall, or without such crops, ``asset`` is returned.
+    of the fit's images, which show the same crops; only crops of at least ``MIN_RATIO`` times as many are used.  held:
+    indices of crops that are compared but not used.  Errors: root mean square of the logarithms in these crops.  If it
+    does not fall, or without such crops, ``asset`` is returned.  No gradient.
     """
+    views = [(crop, crop.camera(pose)) for crop, pose in zip(crops, c2w, strict=True)]
+    fine = [v for v, (_, camera) in enumerate(views) if camera.width >= MIN_RATIO * coarse]
+    compared, used = ([views[v] for v in fine if (v in held) == kept] for kept in (True, False))
+    if not compared or not used:
+        return asset, (0.0, 0.0)
     mesh, textures = asset.mesh, present("asset.textures", asset.textures)
-    scene = RayScene(mesh.vertices, mesh.faces)
-    used = [(crops[v], crops[v].camera(c2w[v])) for v in range(len(crops)) if v not in held]
-
-    def at_texels(position: Tensor, normal: Tensor) -> Tensor:
-        total, weights = torch.zeros_like(position), position.new_full((len(position), 1), MIN_WEIGHT)
-        for crop, camera in used:
-            ratio, valid = log_ratio(asset, scene, crop, camera, coarse)
-            rows, value, weight = _at_points(ratio, valid, scene, position, normal, camera)
-            total.index_add_(0, rows, weight * value)
-            weights.index_add_(0, rows, weight)
-        return total / weights
-
-    size = textures.size
-    detail = bake(mesh, size, at_texels, chunk=size * size)["value"]
-    base_color = (textures.base_color * detail.exp()).clamp(0.0, 1.0)
+    scene, size = RayScene(mesh.vertices, mesh.faces), textures.size
+    texels = rasterize_texels(mesh, size)
+    maps = bake(mesh, size, lambda position, normal: {"p": position, "n": normal}, texels=texels, fill=False)
+    position, normal = (maps[name].reshape(-1, 3) for name in "pn")
+    chunks = torch.nonzero(texels.valid.reshape(-1))[:, 0].split(TEXELS_PER_CHUNK)
+    total, weights = torch.zeros_like(position), torch.full_like(position[:, :1], MIN_WEIGHT)
+    for crop, camera in used:
+        ratio, valid = log_ratio(asset, scene, crop, camera, coarse)
+        for chunk in chunks:
+            rows, value, weight = _at_points(ratio, valid, scene, position[chunk], normal[chunk], camera)
+            total.index_add_(0, chunk[rows], weight * value)
+            weights.index_add_(0, chunk[rows], weight)
+    factor = (total / weights).exp().reshape(size, size, 3)
+    base_color = (textures.base_color * factor).clamp(0.0, 1.0)
     found = replace(asset, textures=replace(textures, base_color=base_color))
-    before, after = (
-        _error(which, scene, [(crops[v], crops[v].camera(c2w[v])) for v in held], coarse) for which in (asset, found)
-    )
+    before, after = (_error(which, scene, compared, coarse) for which in (asset, found))
     return (found if after < before else asset), (before, after)
 
 
@@ -87,26 +94,23 @@ def log_ratio(asset: Asset, scene: RayScene, crop: Crop, camera: Camera, coarse:
 
     Left out are saturated pixels and those next to outlines and depth edges.
     """
-    mesh = asset.mesh
-    ratio = max(1.0, camera.width / coarse)
+    finer = camera.width / coarse
     hits, *_ = primary_hits(scene, camera)
     hit = hits.face >= 0
-    uv = interpolate(present("mesh.uv", mesh.uv), mesh.faces, hits.face[hit], hits.bary[hit])
-    base = torch.zeros(*hit.shape, 3, device=hit.device)
-    base[hit] = sample_texture(present("asset.textures", asset.textures).base_color, uv)
+    base = torch.zeros(*hit.shape, 3, device=hit.device, dtype=torch.float32)
+    base[hit] = surface_points(asset.mesh, asset.textures, hits.face[hit], hits.bary[hit]).base_color
     color = srgb_to_linear(crop.color.float() / 255.0)
-    low, high = mesh.vertices.aminmax(dim=0)
     depth = torch.where(hit, hits.t, math.inf)
     near, far = -max_pool2d(-depth[None], 3, 1, 1)[0], max_pool2d(depth[None], 3, 1, 1)[0]
-    inside = (crop.mask >= 255 * INSIDE_COVERAGE) & (far - near < DEPTH_EDGE * float((high - low).max()))
-    reach = 2 * round(ratio) + 1
+    inside = (crop.mask >= 255 * INSIDE_COVERAGE) & (far - near < MAX_DEPTH_RANGE / camera.intrinsics[0] * near)
+    reach = 2 * round(finer) + 1
     valid = max_pool2d((~inside).float()[None], reach, 1, reach // 2)[0] == 0.0
     valid &= (color < SATURATED_LINEAR).all(-1)
-    sigma = CUTOFF * ratio
     planes = (torch.cat([color, base], -1) * valid[..., None]).permute(2, 0, 1)
-    means = blurred(planes, sigma)
+    means = blurred(planes, LOW_PASS_SIGMA * finer)
     shading = (means[:3] / means[3:].clamp(min=1e-6)).permute(1, 2, 0)
-    return ((color + DARK) / (base * shading + DARK)).log() * valid[..., None], valid
+    ratio = ((color + NOISE_FLOOR) / (base * shading + NOISE_FLOOR)).log()
+    return ratio.clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO) * valid[..., None], valid
 
 
 def blurred(planes: Tensor, sigma: float) -> Tensor:
@@ -127,20 +131,21 @@ def _at_points(
     eye = camera.position - position
     distance = eye.norm(dim=1)
     cosine = (eye * normal).sum(1) / distance
-    rows = torch.nonzero(cosine > MIN_COSINE)[:, 0]
+    rows = torch.nonzero(cosine > MIN_FACING_COSINE)[:, 0]
     rows = rows[visible_from(scene, position[rows], normal[rows], one)[:, 0]]
     pixels, _ = project(position[rows], camera.c2w, camera.intrinsics)
     where = (2.0 * pixels / camera.width - 1.0)[None, None]
     planes = torch.cat([values, valid[..., None].float()], -1).permute(2, 0, 1)[None]
     found = grid_sample(planes, where, mode="bilinear", padding_mode="zeros", align_corners=False)[0, :, 0].T
-    density = camera.intrinsics[0] / camera.width / distance[rows]  # about 1
-    weight = (found[:, 3] > 0.99) * cosine[rows] ** COSINE_POWER * density.square()
+    resolution = camera.intrinsics[0] * scene.scale / distance[rows]
+    weight = (found[:, 3] > 0.99) * cosine[rows] ** COSINE_POWER * resolution.square()
     return rows, found[:, :3], weight[:, None]
 
 
-def _error(asset: Asset, scene: RayScene, held: Sequence[tuple[Crop, Camera]], coarse: int) -> float:
+def _error(asset: Asset, scene: RayScene, views: Sequence[tuple[Crop, Camera]], coarse: int) -> float:
+    """Root mean square of :func:`log_ratio` over the valid pixels of ``views``; 0 if there are none."""
     total, count = 0.0, 0
-    for crop, camera in held:
+    for crop, camera in views:
         ratio, valid = log_ratio(asset, scene, crop, camera, coarse)
         total, count = total + float(ratio.square().sum()), count + 3 * int(valid.sum())
     return math.sqrt(total / max(count, 1))

@@ -18,14 +18,12 @@ from reli3d.fit.choice import UNCHANGED, Fitted, Parts, chosen, mean_psnr, view_
 from reli3d.fit.input_images import InputImages, PosedImages
 from reli3d.fit.light_frame import light_follows_camera
 from reli3d.fit.light_hue import CHROMATICITY_WEIGHT, with_neutral_light
-from reli3d.fit.light_start import solve_lighting
-from reli3d.fit.maps import FixedSurface, fit_maps, traced
+from reli3d.fit.maps import FixedSurface, fit_maps
 from reli3d.fit.material_start import best_material_start
 from reli3d.fit.shape import ShapeData, empty, finished, fit_shape, start_grid
 from reli3d.fit.transfer import transfer_textures
 from reli3d.fit.unknowns import START_GRID, Start, Unknowns, corrected, filled_grid
 from reli3d.geometry.mesh import Mesh, watertight
-from reli3d.geometry.rays import RayScene
 from reli3d.kernels import cache, flexicubes_adjoint, shade_adjoint  # noqa: F401 # they are compiled before the fit
 from reli3d.render.asset import Asset
 
@@ -187,11 +185,7 @@ def _fitted(data: FixedSurface, options: RefineOptions, budget: Budget, notes: l
     if closed:
         grid, sdf, bound = start_grid(first.mesh, images, options.resolution)
     unknowns = Unknowns.zero(sdf, len(images), min(MAX_DETAIL_TEXELS, texels), max(images.light_group) + 1)
-    scene = RayScene(first.mesh.vertices, first.mesh.faces)
-    pixels = traced(data, scene, seed)
-    solve_lighting(unknowns, data, pixels, scene)
-    fit_maps(unknowns, data, weights, budget, Part("light", LIGHT_UNTIL), seed=seed, detail=False, pixels=pixels)
-    del scene, pixels
+    fit_maps(unknowns, data, weights, budget, Part("light", LIGHT_UNTIL), seed=seed, detail=False)
     if closed:
         around = filled_grid(first.mesh.vertices, data.received, START_GRID)
         shape = ShapeData.of(start, sdf, bound, grid, around, images, used)

@@ -1,7 +1,14 @@
 """Detail of photographs in the base color: a textured square, photographed in closed form under smooth shading."""
 
+from dataclasses import replace
+
+import pytest
 import torch
 
+import reli3d
+from reli3d import pipeline
+from reli3d.fit import refine as fit
+from reli3d.fit.choice import Parts
 from reli3d.fit.fine_detail import Crop, with_fine_detail
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.mesh import Mesh
@@ -57,10 +64,13 @@ def inner(values: torch.Tensor) -> torch.Tensor:
     return values[24:-24, 24:-24]
 
 
-def test_the_detail_of_photographs_comes_into_the_base_color_and_their_shading_does_not():
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_the_detail_of_photographs_comes_into_the_base_color_and_their_shading_does_not(unit):
     truth = pattern(texel_positions())
     flat = square(0.0, torch.full((TEXELS, TEXELS, 3), 0.3))
+    flat = replace(flat, mesh=replace(flat.mesh, vertices=unit * flat.mesh.vertices))
     crops, c2w = photographed()
+    c2w[:, :3, 3] *= unit
     found, (before, after) = with_fine_detail(flat, crops, c2w, COARSE, held=[3])
     error = inner(found.textures.base_color - truth).square().mean().sqrt()
     start = inner(flat.textures.base_color - truth).square().mean().sqrt()
@@ -99,3 +109,43 @@ def test_hidden_texels_keep_their_color():
     changed = (found.textures.base_color - 0.3).abs().amax(-1)
     assert changed[:, :128].max() > 0.1
     assert changed[80:175, 145:240].max() == 0.0  # the square behind
+
+
+def test_crops_of_low_resolution_do_not_blur_the_others():
+    flat = square(0.0, torch.full((TEXELS, TEXELS, 3), 0.3))
+    crops, c2w = photographed()
+    sharp = with_fine_detail(flat, crops, c2w, COARSE, held=[3])[0]
+    gray = lambda at: torch.full_like(at, 0.3)  # as if blurred
+    small, small_c2w = photographed(gray, EYES[:1])
+    size = round(1.3 * COARSE)
+    color, mask = (
+        torch.nn.functional.interpolate(v.float().permute(2, 0, 1)[None], (size, size), mode="area")[0].permute(1, 2, 0)
+        for v in (small[0].color, small[0].mask[..., None])
+    )
+    low = Crop(color.to(torch.uint8), mask[..., 0].to(torch.uint8), small[0].intrinsics * size / PIXELS)
+    mixed = with_fine_detail(flat, [*crops, low], torch.cat([c2w, small_c2w]), COARSE, held=[3])[0]
+    contrast = [inner(a.textures.base_color)[..., 0].std() for a in (sharp, mixed)]
+    assert contrast[1] > 0.9 * contrast[0]  # with equal weights 3/4
+    none = with_fine_detail(flat, crops, c2w, round(PIXELS / 1.2), held=[3])[0]
+    assert none is flat  # the fit's images show the same detail
+
+
+def test_saturated_pixels_add_nothing():
+    flat = square(0.0, torch.full((TEXELS, TEXELS, 3), 0.3))
+    spots = lambda at: torch.where(pattern(at)[..., :1] > 0.4, 3.0, 0.3).expand_as(at)  # clipped at white
+    found, _ = with_fine_detail(flat, *photographed(spots), COARSE, held=[3])
+    assert found.textures.base_color.max() < 0.4  # the factor of a spot is 10, limited to 2
+
+
+def test_a_refinement_ends_with_the_detail_of_its_photographs(monkeypatch):
+    flat = square(0.0, torch.full((TEXELS, TEXELS, 3), 0.3))
+    monkeypatch.setattr(pipeline, "REFINED", COARSE)
+    crops, c2w = photographed()
+    images, masks = (tuple(c.float() / 255.0 for c in values) for values in zip(*((c.color, c.mask) for c in crops)))
+    views = reli3d.Views(images, masks, c2w, torch.stack([c.intrinsics for c in crops]), ("a", "b", "c", "d"))
+    done = fit.Refinement(flat, Parts(1.0, 1.0, 1.0), (20.0, 20.0), (25.0, 25.0), (3,), c2w, ())
+    monkeypatch.setattr(fit, "refine", lambda *_, **__: done)
+    found = reli3d.refine(flat, views, steps=1)
+    assert inner(found.textures.base_color - pattern(texel_positions())).square().mean().sqrt() < 0.05
+    monkeypatch.setattr(fit, "refine", lambda *_, **__: replace(done, parts=Parts(0.0, 0.0, 0.0)))
+    assert reli3d.refine(flat, views, steps=1) is flat
