@@ -8,7 +8,7 @@ import torch
 
 from reli3d.geometry.camera import look_at
 from reli3d.geometry.topology import graph_components
-from reli3d.synthetic import furniture, manmade, organic, vessels
+from reli3d.synthetic import furniture, manmade, organic, vessels, wires
 from reli3d.synthetic.assembly import ON_BACK, ON_SIDE, Assembly
 from reli3d.synthetic.finishes import draw_materials
 from reli3d.synthetic.materials import Material
@@ -20,6 +20,7 @@ CREASE_DEG = 38.0  # facets of rounded edges meet at 30 degrees at most, faces o
 MIN_VOLUME_FRACTION = 2e-4  # volume over cubed longest side: a sword has 1e-3, a sheet seen edge-on less
 FRAME_RADIUS = 0.87  # half diagonal of the unit cube: contains objects of longest side 1
 
+WIRE_PROBABILITY, WIRE_STREAM = 0.04, 1000  # decided by a stream of its own, so that other objects do not depend on it
 FAMILIES = (
     (manmade.csg, 0.2), (vessels.vessel, 0.12), (vessels.lamp, 0.05), (manmade.device, 0.12),
     (vessels.container, 0.08), (manmade.tool, 0.05), (manmade.profile, 0.05), (furniture.table, 0.05),
@@ -42,9 +43,14 @@ class ProceduralObject:
 
 
 def make_object(seed: int) -> ProceduralObject:
-    """The object of ``seed``: a random family, deformation, pose and materials.  Raises ValueError below 0."""
+    """The object of ``seed``: a wire or a random family, deformed; pose and materials.  Raises ValueError below 0."""
     if seed < 0:
         raise ValueError(f"seed: expected at least 0, got {seed}")
+    if is_wire(seed):
+        assembly = Assembly(np.random.default_rng((seed, 0)))
+        wires.wire(assembly)
+        _pose(assembly)
+        return assemble(assembly, "wire")
     weights = np.array([w for _, w in FAMILIES])
     for attempt in itertools.count():  # a cut may leave nothing or a thin sheet: draw again from the next stream
         assembly = Assembly(np.random.default_rng((seed, attempt)))
@@ -55,6 +61,13 @@ def make_object(seed: int) -> ProceduralObject:
     _deform(assembly)
     _pose(assembly)
     return assemble(assembly, family.__name__)
+
+
+def is_wire(seed: int) -> bool:
+    """Whether the object of ``seed`` is of thin tubes: some of the training objects are, no held-out one is."""
+    if seed in VALIDATION_SEEDS or seed in TEST_SEEDS:
+        return False
+    return np.random.default_rng((seed, WIRE_STREAM)).random() < WIRE_PROBABILITY
 
 
 def assemble(assembly: Assembly, name: str) -> ProceduralObject:
