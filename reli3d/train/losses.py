@@ -42,15 +42,16 @@ def pixel_losses(model: LocalReconstructor, group: Group) -> dict[str, Tensor]:
 
 
 def losses(model: LocalReconstructor, sample: Sample) -> dict[str, Tensor]:
-    """Unweighted terms, each a scalar; gradients reach every parameter."""
+    """Unweighted terms, each a scalar, those of pixels if one is covered; gradients reach every parameter."""
     field, count = encode_sample(model, sample), len(sample.images)
     position, normal, bumped = (t.contiguous() for t in sample.surface.unbind(1))
     normal, bumped = functional.normalize(normal, dim=-1), functional.normalize(bumped, dim=-1)
     field = field.with_shading(position, normal, sample.visible)
+    pixels = field.pixels.of_views(count), field.color[:count], sample, (count,)
     return {
         **_shape_terms(field, sample, position, normal),
         **_material_terms(field, sample, position, normal, bumped),
-        **_pixel_terms(field.pixels.of_views(count), field.color[:count], sample, (count,)),
+        **(_pixel_terms(*pixels) if bool(sample.view_valid.any()) else {}),  # means over no pixel are NaN
         **_light_terms(field, sample),
     }
 

@@ -124,13 +124,16 @@ def test_pixels_alone_are_evaluated_as_with_the_rest(files):
 
 
 def test_an_object_without_a_whole_pixel_has_no_terms(files):
-    """A thin object in a small image: the others are evaluated as without it."""
+    """A thin object in a small image: the others are evaluated as without it.  Alone, it has its other terms."""
     model = learned(2)
     objects = [read_views_reduced(f, 4).of_views(slice(0, 2)) for f in files]
     empty = dataclasses.replace(objects[1], view_valid=torch.zeros_like(objects[1].view_valid))
     both, alone = (pixel_losses(model, Group.of(parts)) for parts in ([objects[0], empty], objects[:1]))
     for name, value in alone.items():
         torch.testing.assert_close(both[name], value, rtol=1e-3, atol=1e-5, msg=name)
+    sample = load_sample(files[1], 1, 64, np.random.default_rng(0), augment=False)
+    terms = losses(learned(), dataclasses.replace(sample, view_valid=torch.zeros_like(sample.view_valid)))
+    assert not set(terms) & set(PIXEL_TERMS) and all(bool(value.isfinite()) for value in terms.values())
 
 
 def test_every_view_of_a_drawn_object_is_read_once(files):
