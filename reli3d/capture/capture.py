@@ -25,7 +25,7 @@ from reli3d.capture.scene import find_scene
 from reli3d.capture.sheet import contact_sheet
 from reli3d.capture.turntable import Position, map_on_turntable, on_turntable, turntable_positions
 from reli3d.errors import InputError, printable
-from reli3d.io.images import decode_image, unit
+from reli3d.io.images import decode_image, unit, with_exposure
 from reli3d.output.folder import check_place, claimed
 from reli3d.views.background import Remover
 from reli3d.views.check import agreement
@@ -301,7 +301,8 @@ def _write(
             progress("writing", k, len(views))
             image = view.undistorted(view.photo.pixels)
             mask = view.undistorted(masks[view.photo.name])
-            Image.fromarray(image).save(work / "images" / f"{name}.jpg", quality=95, subsampling=0)
+            exif = with_exposure(view.photo.exposure)
+            Image.fromarray(image).save(work / "images" / f"{name}.jpg", quality=95, subsampling=0, exif=exif)
             Image.fromarray(mask).save(work / "masks" / f"{name}.png", pnginfo=comment)
             pose = view.c2w
             pose[:3, :3] = frame.rotation @ pose[:3, :3]

@@ -15,7 +15,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from reli3d.errors import InputError, shown
 from reli3d.io.files import file_size
-from reli3d.io.images import FORMATS, check_depth, in_srgb
+from reli3d.io.images import FORMATS, check_depth, exposure_data, in_srgb
 from reli3d.views.masks import alpha_values
 from reli3d.views.missing_cameras import PHOTOGRAPHS, VIDEOS, capture_command
 
@@ -44,6 +44,7 @@ class Photo:
     lens: tuple  # equal for photographs of one lens and size
     flash: bool = False
     alpha: np.ndarray | None = None  # (H, W) uint8, if some of it is transparent: a mask
+    exposure: tuple[float, float, float] | None = None  # of reli3d.io.images.exposure_data
 
     @property
     def size(self) -> tuple[int, int]:
@@ -131,7 +132,7 @@ def _read_photo(path: Path, name: str, notes: list[str]) -> Photo:
                 raise InputError(path, f"{TOO_LARGE}, got {image.width} x {image.height}; save it smaller")
             exif = image.getexif()
             tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-            stored = image.size
+            stored, exposure = image.size, exposure_data(image)
             image.draft("RGB", (LONGEST_SIDE, LONGEST_SIDE))
             upright = ImageOps.exif_transpose(image)
             check_depth(path, upright)
@@ -154,7 +155,7 @@ def _read_photo(path: Path, name: str, notes: list[str]) -> Photo:
     focal = focal_from_exif(tags, stored, longest)
     lens = (upright.size, str(tags.get(ExifTags.Base.Model, "")), round(focal) if focal else None)
     fired = int(_number(tags.get(ExifTags.Base.Flash), 0.0)) % 2 == 1  # the other bits say how it was set
-    return Photo(name, np.asarray(upright), focal, lens, fired, np.asarray(alpha) if alpha else None)
+    return Photo(name, np.asarray(upright), focal, lens, fired, np.asarray(alpha) if alpha else None, exposure)
 
 
 def focal_from_exif(tags: dict, stored: tuple[int, int], longest: int) -> float | None:

@@ -4,6 +4,7 @@ Color is sRGB in [0, 1] as stored; alpha is straight (not premultiplied), and co
 """
 
 import io
+import math
 import os
 import re
 import struct
@@ -27,6 +28,7 @@ MAX_BYTES = 1 << 29  # an uncompressed 16-bit RGBA image of MAX_PIXELS
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF")  # nothing that runs a program or unpacks streams of its own
 MAX_SCANS = 100  # progressive files have about ten; a thousand in a small file take minutes
 ORIENTATION = 0x0112  # of EXIF
+EXPOSURE_TAGS = ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings
 QUARTER_TURNS = (5, 6, 7, 8)  # orientations that exchange the sides
 INVERSES = {6: 8, 8: 6}  # of orientations; the others are their own inverses
 _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # start of a JPEG segment; other bytes after 0xff are data
@@ -157,6 +159,37 @@ def _decoded(
     mode = "RGBA" if image.has_transparency_data else "L" if image.mode in ("1", "L") else "RGB"
     image.load()
     return image if image.mode == mode else image.convert(mode)
+
+
+def exposure_data(image: Image.Image) -> tuple[float, float, float] | None:
+    """Exposure time [s], f-number and sensitivity (ISO) of the EXIF data; None if one is missing or not positive."""
+    try:
+        tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        time, f_number, iso = (float(tags[key]) for key in EXPOSURE_TAGS)
+    except Exception:  # decoders of broken EXIF data raise almost anything
+        return None
+    return (time, f_number, iso) if all(0.0 < value < math.inf for value in (time, f_number, iso)) else None
+
+
+def with_exposure(data: tuple[float, float, float] | None) -> bytes:
+    """EXIF data with the values of :func:`exposure_data`; empty for None."""
+    if data is None:
+        return b""
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif).update(zip(EXPOSURE_TAGS, data, strict=True))
+    return exif.tobytes()
+
+
+def exposure(path: str | os.PathLike) -> float | None:
+    """Exposure of an image file by its EXIF data, time * ISO / f-number^2, to which linear values are proportional.
+
+    None if it is not known.  The file must be one that :func:`decode_image` has read.
+    """
+    with _OPENING, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # broken EXIF data
+        with Image.open(path, formats=FORMATS) as image:
+            data = exposure_data(image)
+    return data and data[0] * data[2] / data[1] ** 2
 
 
 def check_depth(path: str | os.PathLike, image: Image.Image) -> None:

@@ -14,11 +14,12 @@ from torch import Tensor
 
 from reli3d._bridge import full_precision, present
 from reli3d.errors import InputError, printable, shown
-from reli3d.io.images import ASPECT, above, color_of, decode_image, unit
+from reli3d.io.images import ASPECT, above, color_of, decode_image, exposure, unit
 from reli3d.views.array_cameras import NEUS, read_llff, read_neus
 from reli3d.views.background import Remover
 from reli3d.views.choose import DUPLICATE_DISTANCE_RAD, choose_views, spread_notes
 from reli3d.views.colmap import find_colmap, read_colmap
+from reli3d.views.exposure import equalized
 from reli3d.views.file_names import ENDINGS, FolderIndex
 from reli3d.views.frames import Frame, Lens, check_distortion, file_within, is_within
 from reli3d.views.masks import MaskFiles, alpha_values, check_one_label, mask_values
@@ -77,7 +78,7 @@ def load_views(
     origin, moved = _origin(frames, folder)
     notes += moved
     remover = Remover() if remove_background else None
-    read: dict[int, tuple[Tensor, Tensor, list[float], list[str], bool]] = {}
+    read: dict[int, tuple[Tensor, Tensor, list[float], float | None, list[str], bool]] = {}
     usable = list(range(len(frames)))  # for the choice: not those whose mask touches the border
     while True:
         taken, choice = _chosen(frames, usable, views)
@@ -103,13 +104,16 @@ def load_views(
         notes.append(f"{reduced} of {len(loaded)} photographs have more than {MAX_FULL_PIXELS} pixels: {part}")
     if remover and remover.masks:
         notes.append(f"{remover.masks} of {len(loaded)} masks made by rembg ({remover.network})")
+    images, masks_of, intrinsics, exposures = zip(*(values[:4] for values in loaded), strict=True)
+    images, found = equalized(images, masks_of, exposures)
+    notes += found
     poses, box = np.stack([f.c2w for f in frames]), frames[0].object_box
     poses[:, :3, 3] -= origin
     return Views(
-        images=tuple(image for image, *_ in loaded),
-        masks=tuple(mask for _, mask, *_ in loaded),
+        images=images,
+        masks=masks_of,
         c2w=torch.from_numpy(poses.astype(np.float32)),
-        intrinsics=torch.tensor([k for _, _, k, *_ in loaded], dtype=torch.float32, device="cpu"),
+        intrinsics=torch.tensor(intrinsics, dtype=torch.float32, device="cpu"),
         names=tuple(f.name for f in frames),
         notes=tuple(dict.fromkeys(notes)),
         in_folder=offered,
@@ -199,8 +203,8 @@ def _cut_off(names: list[str], cut_off: list[int], usable: list[int]) -> list[st
 
 def _load(
     root: Path, frame: Frame, files: MaskFiles, whole: bool, remover: Remover | None
-) -> tuple[Tensor, Tensor, list[float], list[str], bool]:
-    """Image, mask, intrinsics and notes of one frame, and whether less than the whole image is kept."""
+) -> tuple[Tensor, Tensor, list[float], float | None, list[str], bool]:
+    """Image, mask, intrinsics, exposure and notes of one frame, and whether less than the whole image is kept."""
     notes: list[str] = []
     path = frame.image
     if not os.path.exists(path):
@@ -225,7 +229,7 @@ def _load(
     image, alpha = color_of(bitmap), unit(mask)
     if looks_premultiplied(image.numpy(), alpha):
         notes.append(f"{path.name}: the color looks multiplied by alpha, edges will be dark; save straight alpha")
-    return image, torch.from_numpy(alpha), camera, notes, part is not None
+    return image, torch.from_numpy(alpha), camera, exposure(path), notes, part is not None
 
 
 def _not_empty(mask: Image.Image, path: Path) -> None:

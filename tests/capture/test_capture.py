@@ -16,11 +16,12 @@ from reli3d.capture.capture import CaptureOptions, capture
 from reli3d.capture.mapping import map_photos
 from reli3d.capture.photos import read_photos
 from reli3d.errors import InputError
+from reli3d.io.images import exposure
 from reli3d.synthetic.procedural import make_object
 from reli3d.views.folder import load_views
 from reli3d.views.normalize import normalize
 from reli3d.views.transforms import read_transforms
-from tests.support.capture_scene import render_capture
+from tests.support.capture_scene import EXPOSURE, render_capture
 from tests.support.rigs import eyes_around, sphere_views
 
 
@@ -230,6 +231,11 @@ def test_the_folder_is_whole_and_is_replaced_only_if_it_is_a_capture(ground_trut
     with pytest.raises(InputError, match="empty folder or an earlier capture"):
         capture(folder / "images", tmp_path / "full")
     assert (tmp_path / "full" / "letter.txt").read_text() == "mine"
+
+
+def test_images_keep_the_exposure_of_their_photographs(captured):
+    for path in (captured[1] / "images").iterdir():
+        assert exposure(path) == pytest.approx(EXPOSURE[0] * EXPOSURE[2] / EXPOSURE[1] ** 2, rel=1e-3)
 
 
 def test_masks_of_undistorted_images_are_refused(ground_truth, captured, tmp_path):

@@ -18,7 +18,7 @@ from PIL import ExifTags, Image, ImageCms
 from reli3d.capture.capture import CaptureOptions, capture
 from reli3d.capture.photos import FEWEST, FRAME_COUNT, focal_from_exif, read_photos, sharpness
 from reli3d.errors import InputError
-from reli3d.io.images import decode_image
+from reli3d.io.images import decode_image, exposure, with_exposure
 
 BASE = ExifTags.Base
 
@@ -168,6 +168,15 @@ def test_what_an_object_folder_cannot_hold_is_no_photograph_either(tmp_path, val
     Image.fromarray(values).save(tmp_path / name, **options)
     with pytest.raises(InputError, match=message):
         read_photos(tmp_path, quiet)
+
+
+def test_exposures_are_read_and_written(tmp_path):
+    for k in range(8):
+        Image.fromarray(textured(k)).save(tmp_path / f"{k}.jpg", exif=with_exposure((1 / (50 + k), 2.8, 100)))
+    photos, _ = read_photos(tmp_path, quiet)
+    assert [p.exposure for p in photos] == [pytest.approx((1 / (50 + k), 2.8, 100.0), rel=1e-3) for k in range(8)]
+    Image.fromarray(textured(0)).save(tmp_path / "copy.jpg", exif=with_exposure(photos[0].exposure))
+    assert exposure(tmp_path / "copy.jpg") == pytest.approx(100 / 50 / 2.8**2, rel=1e-3)
 
 
 def test_flash_and_mixed_sizes_are_reported(tmp_path):

@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 
 from reli3d.geometry.camera import Camera, camera_rays, look_at
+from reli3d.io.images import with_exposure
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.shading import Samples, ShadeOptions, shade
@@ -17,6 +18,7 @@ from reli3d.synthetic.patterns import mosaic as spots
 from reli3d.synthetic.procedural import ProceduralObject, make_object, yaw_matrix
 from reli3d.synthetic.samples import ObjectSurface
 
+EXPOSURE = 1 / 60, 2.8, 100.0  # time [s], f-number, ISO
 TABLE = 1.6  # half side, object's longest side 1
 
 
@@ -32,7 +34,7 @@ class TrueCapture:
     def write(self, folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         for k, image in enumerate(self.images):
-            Image.fromarray(image).save(folder / f"{k:03d}.png")
+            Image.fromarray(image).save(folder / f"{k:03d}.png", exif=with_exposure(EXPOSURE))
         return folder
 
 

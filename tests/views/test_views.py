@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -6,7 +7,6 @@ import torch
 from reli3d.geometry.camera import project
 from reli3d.geometry.hull import mask_distance
 from reli3d.pipeline import refine
-from reli3d.render.asset import Asset
 from reli3d.render.color import srgb_to_linear
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import MASK_EDGE, Views, mask_box
@@ -132,12 +132,11 @@ def test_views_are_checked():
 def test_cut_off_views_are_left_out_of_a_refinement_while_three_remain(monkeypatch):
     views = sphere_views(count=9, size=(64, 64))
     cut_off = (torch.ones_like(views.masks[0]), *views.masks[1:])
-    fitted = []
+    fitted, asset = [], small_scene.ball()
+    result = SimpleNamespace(asset=asset, changed=False)
     monkeypatch.setattr(
-        "reli3d.fit.refine.refine", lambda asset, batch, options, **_: fitted.append((batch, options)) or asset
+        "reli3d.fit.refine.refine", lambda asset, batch, options, **_: fitted.append((batch, options)) or result
     )
-    asset = small_scene.ball()
-    monkeypatch.setattr(Asset, "asset", None, raising=False)  # of the result
     refine(asset, replace(views, masks=cut_off), steps=1, light=list(range(9)))
     refine(asset, replace(views, masks=cut_off).select(3), steps=1)  # two others
     assert [len(batch) for batch, _ in fitted] == [8, 3] and fitted[0][1].light == list(range(1, 9))
