@@ -2,7 +2,7 @@
 
 Modules, imported by name (``import reli3d.fit.maps``):
 
-- stages: refine (all of them), shape, material_start, maps, lighting
+- stages: refine (all but the last), shape, material_start, maps, lighting, fine_detail
 - data: input_images, view_colors, bounce, light_frame, light_hue
 - parts: losses, unknowns, fields, choice, budget, facets, transfer
 """
