@@ -6,6 +6,7 @@ writes the result.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from reli3d.fit.refine import Refinement
 
 REFINED = 384  # pixels per side of the views that a refinement compares with
+MAX_CROP_PIXELS = 3 << 23  # of all photographs whose detail is added: 100 MB during the fit
 LEAST_REFINED = 3  # views with the complete object from which a refinement leaves out the others
 INSIDE = 2.0  # pixels from the silhouette within which colors may be mixed with the background
 MIN_PART_FRACTION = 0.01  # of the faces; smaller components are removed
@@ -419,9 +421,9 @@ def _detail_crops(views: Views, texels: int) -> list[Crop]:
     """The views cropped as by ``Views.resampled``, at their own resolution but at most ``texels`` pixels per side."""
     from reli3d.fit.fine_detail import Crop
 
-    crops = []
+    crops, largest = [], min(texels, math.isqrt(MAX_CROP_PIXELS // len(views)))
     for k, mask in enumerate(views.masks):
-        one = views.select([k]).resampled(min(crop_side(mask), texels), linear=True)
+        one = views.select([k]).resampled(min(crop_side(mask), largest), linear=True)
         color, cover = ((255.0 * values[0] + 0.5).to(torch.uint8) for values in (one.images, one.masks))
         crops.append(Crop(color, cover, one.intrinsics[0]))
     return crops
