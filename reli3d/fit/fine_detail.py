@@ -119,8 +119,11 @@ def blurred(planes: Tensor, sigma: float) -> Tensor:
     at = torch.arange(-reach, reach + 1, device=planes.device, dtype=torch.float32)
     kernel = torch.exp(-at.square() / (2.0 * sigma * sigma))
     kernel = kernel / kernel.sum()
-    planes = conv2d(planes[:, None], kernel[None, None, :, None], padding=(reach, 0))
-    return conv2d(planes, kernel[None, None, None, :], padding=(0, reach))[:, 0]
+    result = torch.empty_like(planes)
+    for k, plane in enumerate(planes):  # one at a time: torch copies each value for every tap
+        rows = conv2d(plane[None, None], kernel[None, None, :, None], padding=(reach, 0))
+        result[k] = conv2d(rows, kernel[None, None, None, :], padding=(0, reach))[0, 0]
+    return result
 
 
 def _at_points(
