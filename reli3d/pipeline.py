@@ -393,11 +393,10 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
 
     The colors of :func:`reli3d.fit.refine.held_out` views are held out.  Material and lighting are each blended between
     start and fit with the first weights for which no mean PSNR (fitted, held-out, all views) is below the start's, with
-    small tolerance; if there are none, the result is ``asset``.  Otherwise
-    :func:`~reli3d.fit.fine_detail.with_fine_detail` follows.
+    small tolerance; if there are none, the result is ``asset``.  Then :mod:`reli3d.fit.fine_detail` follows.
 
     views: in the frame of ``asset``; those that cut the object off are left out while three others remain.  seconds,
-    steps: the budget, exactly one; with ``steps`` the result is reproducible.  options: see
+    steps: exactly one; with ``steps`` the result is reproducible.  options: see
     :class:`reli3d.fit.refine.RefineOptions`.  The result has no gradients.  Raises TypeError for a wrong type,
     ValueError for both or no budget.
 

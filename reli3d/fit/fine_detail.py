@@ -55,14 +55,14 @@ def with_fine_detail(
 ) -> tuple[Asset, tuple[float, float]]:
     """``asset`` with fine detail of photographs added to its base color, and the errors before and after.
 
-    A photograph is compared with the base color in its view times the local mean of the shading, the quotient of the
-    low-pass filtered photograph and base color.  The logarithms of the ratios are averaged over the views at every
-    texel and added to the base color's.  Views count by resolution and by the cosine of the viewing angle.
+    A photograph is compared with the base color in its view times the local mean of the shading, the quotient of both
+    images after low-pass filtering.  The weighted mean over the views of :func:`log_ratio` is added to the logarithm of
+    the base color.
 
     asset: with textures, uv and normals.  c2w: ``(V, 4, 4)``, poses of the crops in its frame.  coarse: pixels per side
-    of the fit's images, which show the same crops; only crops of at least ``MIN_RATIO`` times as many are used.  held:
-    indices of crops that are compared but not used.  Errors: root mean square of the logarithms in these crops.  If it
-    does not fall, or without such crops, ``asset`` is returned.  No gradient.
+    of the fit's images of the same crops; crops below ``MIN_RATIO`` times as many are not used.  held: indices of crops
+    that are only compared.  Errors: root mean square of the logarithms in these; if it does not fall, or without such
+    crops, ``asset`` is returned.  No gradient.
     """
     views = [(crop, crop.camera(pose)) for crop, pose in zip(crops, c2w, strict=True)]
     fine = [v for v, (_, camera) in enumerate(views) if camera.width >= MIN_RATIO * coarse]

@@ -9,9 +9,10 @@ import reli3d
 from reli3d import pipeline
 from reli3d.fit import refine as fit
 from reli3d.fit.choice import Parts
-from reli3d.fit.fine_detail import Crop, with_fine_detail
+from reli3d.fit.fine_detail import Crop, log_ratio, with_fine_detail
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
@@ -149,3 +150,19 @@ def test_a_refinement_ends_with_the_detail_of_its_photographs(monkeypatch):
     assert inner(found.textures.base_color - pattern(texel_positions())).square().mean().sqrt() < 0.05
     monkeypatch.setattr(fit, "refine", lambda *_, **__: replace(done, parts=Parts(0.0, 0.0, 0.0)))
     assert reli3d.refine(flat, views, steps=1) is flat
+
+
+def test_nothing_is_added_beside_a_depth_edge():
+    """A square in front of another; in the photographs its outline lies two pixels off, as of a wrong surface."""
+    gray = torch.full((TEXELS, TEXELS, 3), 0.3)
+    back, front = square(0.0, gray), square(0.5, gray)
+    uv = torch.cat([back.mesh.uv * torch.tensor([0.5, 1.0]), 0.4 * front.mesh.uv + torch.tensor([0.55, 0.3])])
+    vertices = torch.cat([back.mesh.vertices, front.mesh.vertices * torch.tensor([0.4, 0.4, 1.0])])
+    mesh = Mesh(vertices, torch.cat([back.mesh.faces, back.mesh.faces + 4]), uv=uv).with_normals()
+    both = Asset(mesh, back.textures, back.environment)
+    half = 0.4 * 3.0 / 2.5 + 2.5 / 128  # of the front square's outline on the plane z = 0, and two pixels
+    color = lambda at: torch.where((at[..., :2].abs() < half).all(-1, keepdim=True), 0.5, 0.2).expand_as(at)
+    (crop,), c2w = photographed(color, EYES[:1])
+    ratio, valid = log_ratio(both, RayScene(mesh.vertices, mesh.faces), crop, crop.camera(c2w[0]), COARSE)
+    edge = (ratio.abs().amax(-1) > 0.2) & valid
+    assert int(edge.sum()) == 0 and int(valid.sum()) > 20_000
