@@ -393,7 +393,7 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
 
     The colors of :func:`reli3d.fit.refine.held_out` views are held out.  Material and lighting are each blended between
     start and fit with the first weights for which no mean PSNR (fitted, held-out, all views) is below the start's, with
-    small tolerance; if there are none, the result is ``asset``.  Then :mod:`reli3d.fit.fine_detail` follows.
+    small tolerance; if none, the result is ``asset``.  Then :mod:`reli3d.fit.fine_detail` follows.
 
     views: in the frame of ``asset``; those that cut the object off are left out while three others remain.  seconds,
     steps: exactly one; with ``steps`` the result is reproducible.  options: see

@@ -55,9 +55,7 @@ def with_fine_detail(
 ) -> tuple[Asset, tuple[float, float]]:
     """``asset`` with fine detail of photographs added to its base color, and the errors before and after.
 
-    A photograph is compared with the base color in its view times the local mean of the shading, the quotient of both
-    images after low-pass filtering.  The weighted mean over the views of :func:`log_ratio` is added to the logarithm of
-    the base color.
+    The weighted mean over the views of :func:`log_ratio` is added to the logarithm of the base color.
 
     asset: with textures, uv and normals.  c2w: ``(V, 4, 4)``, poses of the crops in its frame.  coarse: pixels per side
     of the fit's images of the same crops; crops below ``MIN_RATIO`` times as many are not used.  held: indices of crops
@@ -92,7 +90,8 @@ def with_fine_detail(
 def log_ratio(asset: Asset, scene: RayScene, crop: Crop, camera: Camera, coarse: int) -> tuple[Tensor, Tensor]:
     """Logarithm ``(S, S, 3)`` of photograph over base color times local shading, and where it is valid ``(S, S)``.
 
-    Left out are saturated pixels and those next to outlines and depth edges.
+    Shading: quotient of photograph and base color after low-pass filtering.  Left out are saturated pixels and those
+    next to outlines and depth edges.
     """
     finer = camera.width / coarse
     hits, *_ = primary_hits(scene, camera)

@@ -13,7 +13,7 @@ Curve = tuple[np.ndarray, bool]
 
 THICKNESS = 0.006, 0.04  # diameter over the longest side of the curves' box
 TURN = np.linspace(0, 2 * np.pi, 141)[:-1]  # six tubes stay below the limit of faces
-GAP_RADII, NEIGHBOR_RADII = 2.2, 4.0  # smallest distance of points that are farther apart along their curve
+NEIGHBOR_RADII, GAP_RADII = 4.0, 2.2  # points farther apart than the first along a curve keep the second in space
 
 
 def wire(a: Assembly) -> None:

@@ -12,10 +12,8 @@ from reli3d.render.color import linear_to_srgb, srgb_to_linear
 MIN_DIFFERENCE_EV = 0.1  # between two photographs, from which they are scaled
 
 
-def equalized(
-    images: Sequence[Tensor], masks: Sequence[Tensor], exposures: Sequence[float | None]
-) -> tuple[tuple[Tensor, ...], list[str]]:
-    """The images scaled in linear light to the geometric mean of the exposures, and a note if they differ.
+def equalize(images: Sequence[Tensor], masks: Sequence[Tensor], exposures: Sequence[float | None]) -> list[str]:
+    """Scales the images in place, in linear light, to the geometric mean of the exposures; a note if these differ.
 
     images: ``(H, W, 3)`` sRGB in [0, 1].  masks: ``(H, W)`` coverage.  exposures: from
     :func:`~reli3d.io.images.exposure`; None: unknown, then nothing changes.  Saturated pixels are white, others are
@@ -24,22 +22,21 @@ def equalized(
     """
     known = [value for value in exposures if value is not None]
     if len(known) < len(exposures) or len(known) < 2:
-        return tuple(images), []
+        return []
     relative = torch.tensor(known, dtype=torch.float64, device="cpu").log()
     relative = relative - relative.mean()
     difference = float(relative.max() - relative.min()) / math.log(2.0)
     if difference < MIN_DIFFERENCE_EV:
-        return tuple(images), []
+        return []
     means = [
         (srgb_to_linear(image).mean(-1) * mask).sum() / mask.sum() for image, mask in zip(images, masks, strict=True)
     ]
     brightness = torch.stack(means).cpu().double().clamp(min=1e-6).log()
     text = f"the exposures of the photographs differ by {difference:.1f} EV (EXIF)"
     if (brightness - relative).var() >= brightness.var():
-        return tuple(images), [f"{text}, their brightness does not; left as they are"]
-    scaled = []
+        return [f"{text}, their brightness does not; left as they are"]
     for image, factor in zip(images, (-relative).exp().tolist(), strict=True):
         linear = srgb_to_linear(image)
         value = linear_to_srgb((factor * linear).clamp(0.0, 1.0))
-        scaled.append(torch.where(linear >= SATURATED_LINEAR, 1.0, value))
-    return tuple(scaled), [f"{text}; scaled to their mean"]
+        image.copy_(torch.where(linear >= SATURATED_LINEAR, 1.0, value))
+    return [f"{text}; scaled to their mean"]

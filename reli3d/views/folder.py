@@ -19,7 +19,7 @@ from reli3d.views.array_cameras import NEUS, read_llff, read_neus
 from reli3d.views.background import Remover
 from reli3d.views.choose import DUPLICATE_DISTANCE_RAD, choose_views, spread_notes
 from reli3d.views.colmap import find_colmap, read_colmap
-from reli3d.views.exposure import equalized
+from reli3d.views.exposure import equalize
 from reli3d.views.file_names import ENDINGS, FolderIndex
 from reli3d.views.frames import Frame, Lens, check_distortion, file_within, is_within
 from reli3d.views.masks import MaskFiles, alpha_values, check_one_label, mask_values
@@ -105,8 +105,7 @@ def load_views(
     if remover and remover.masks:
         notes.append(f"{remover.masks} of {len(loaded)} masks made by rembg ({remover.network})")
     images, masks_of, intrinsics, exposures = zip(*(values[:4] for values in loaded), strict=True)
-    images, found = equalized(images, masks_of, exposures)
-    notes += found
+    notes += equalize(images, masks_of, exposures)
     poses, box = np.stack([f.c2w for f in frames]), frames[0].object_box
     poses[:, :3, 3] -= origin
     return Views(

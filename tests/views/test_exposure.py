@@ -22,7 +22,7 @@ def radiance() -> torch.Tensor:
 
 
 def folder(path, exposed=TIMES, stated=TIMES, f_number=4.0, iso=200):
-    """An object folder; the images are exposed for ``exposed`` seconds, EXIF says ``stated`` (None: nothing)."""
+    """An object folder; images exposed for ``exposed`` seconds, with ``stated`` in the EXIF data (None: nothing)."""
     alpha = np.zeros((SIZE, SIZE, 1), np.uint8)
     alpha[8:40, 8:40] = 255
     frames = []
