@@ -46,15 +46,22 @@ from reli3d.render.latlong import lat_long_directions
 from reli3d.views.check import up_axis, verdict
 from reli3d.views.folder import load_views
 from reli3d.views.normalize import FAR_DISTANCES, normalize
-from reli3d.views.published_views import BACKGROUNDS, background_shown, hero_first, placement_notes
+from reli3d.views.published_views import (
+    BACKGROUNDS,
+    background_shown,
+    has_background,
+    hero_first,
+    placement_notes,
+)
 from reli3d.views.similarity import Similarity, output_frame
-from reli3d.views.views import Views, crop_side, whole_views
+from reli3d.views.views import ViewBatch, Views, crop_side, whole_views
 
 if TYPE_CHECKING:
     from reli3d.fit.fine_detail import Crop
     from reli3d.fit.refine import Refinement
 
 REFINED = 384  # pixels per side of the views that a refinement compares with
+BACKGROUND = 64  # pixels per side of the whole images whose background a refinement reads
 MAX_CROP_PIXELS = 3 << 23  # of all photographs whose detail is added: 100 MB during the fit
 LEAST_REFINED = 3  # views with the complete object from which a refinement leaves out the others
 INSIDE = 2.0  # pixels from the silhouette within which colors may be mixed with the background
@@ -388,7 +395,8 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
 
 
 @full_precision
-def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
+def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None,
+           background: str = "masked", **options) -> Asset:  # fmt: skip
     """Refines mesh, maps and lighting of ``asset`` by inverse rendering of ``views``.
 
     The colors of :func:`reli3d.fit.refine.held_out` views are held out.  Material and lighting are each blended between
@@ -396,9 +404,10 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     small tolerance; if none, the result is ``asset``.  Then :mod:`reli3d.fit.fine_detail` follows.
 
     views: in the frame of ``asset``; those that cut the object off are left out while three others remain.  seconds,
-    steps: exactly one; with ``steps`` the result is reproducible.  options: see
-    :class:`reli3d.fit.refine.RefineOptions`.  The result has no gradients.  Raises TypeError for a wrong type,
-    ValueError for both or no budget.
+    steps: exactly one; with ``steps`` the result is reproducible.  background: ``masked``, or ``visible`` if the views
+    show a far background, which is then used as lighting.  options: see :class:`reli3d.fit.refine.RefineOptions`.  The
+    result has no gradients.  Raises TypeError for a wrong type, ValueError for both or no budget, InputError if a view
+    lacks the ``visible`` background.
 
     >>> views = reli3d.load_views("photos/shoe", every=True)
     >>> asset = reli3d.refine(reli3d.reconstruct(views.taken()), views, seconds=60)
@@ -412,9 +421,25 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     options = {"light": views.lighting, **options}
     views, options["light"] = _complete_views(views, options["light"])
     views = views.to(asset.mesh.vertices.device)
+    if background not in ("masked", "visible"):
+        raise InputError("background", f"expected masked or visible, got {background}")
+    if background == "visible":
+        options["background"] = _with_surroundings(views, options["light"])
     batch = views.resampled(REFINED, linear=True)
     result = fit.refine(asset, batch, seconds=seconds, steps=steps, options=fit.RefineOptions(**options))
     return _with_detail(result, _detail_crops(views, present("asset.textures", asset.textures).size))[0]
+
+
+def _with_surroundings(views: Views, light: str | Sequence) -> ViewBatch:
+    """The views without crop, for ``RefineOptions.background``.  Raises InputError if one has no background."""
+    if light == "camera":
+        raise InputError(
+            "background", "visible: expected lighting that does not move with the camera, got light camera"
+        )
+    for name, image, mask in zip(views.names, views.images, views.masks, strict=True):
+        if not has_background(image, mask):
+            raise InputError("background", f"visible: expected images with a background, got a cut-out, {name}")
+    return views.resampled(BACKGROUND, crop=False, linear=True)
 
 
 def _detail_crops(views: Views, texels: int) -> list[Crop]:
@@ -525,13 +550,15 @@ def reconstruct_folder(
     with watch.stage("reading"):
         whole = published_input(model.preset) or (_reads_background(model) and options.background != "masked")
         photographs = reading.read(folder, whole=whole)
-        views, batch = photographs.taken(), None
+        views, batch, around = photographs.taken(), None, None
         if reading.budget:
             complete, light = _complete_views(photographs, reading.lighting(photographs))
             if left_out := len(photographs) - len(complete):
                 note = f"refinement: {left_out} images that cut the object off are left out"
                 views = replace(views, notes=(*views.notes, note))
             batch, names = complete.resampled(REFINED, linear=True), complete.names
+            if options.background == "visible":
+                around = _with_surroundings(complete, light)
             crops = _detail_crops(complete, options.texture_size)
             del complete
         del photographs  # 1 GB of 60 images of 1 MP
@@ -543,7 +570,9 @@ def reconstruct_folder(
             placed = place(views, model.preset, options)
         progress.report(placed.views.notes[len(views.notes) :])
         views = placed.views
-        asset = reconstruct_placed(placed, model, options, watch)
+        ignored = around is not None and not _reads_background(model)
+        of_network = replace(options, background="masked") if ignored else options
+        asset = reconstruct_placed(placed, model, of_network, watch)
     progress.report(watch.notes)
     output = placed.output_from_input
     shown, compared, first, record = views.transformed(output), None, None, {}
@@ -552,7 +581,9 @@ def reconstruct_folder(
             from reli3d.fit import refine as fit
 
             batch = replace(batch, c2w=output.of_cameras(batch.c2w)).to(model.device)
-            chosen = fit.RefineOptions(light=light, cameras=reading.cameras)
+            if around is not None:
+                around = replace(around, c2w=output.of_cameras(around.c2w)).to(model.device)
+            chosen = fit.RefineOptions(light=light, cameras=reading.cameras, background=around)
             budget: dict[str, Any] = dict(reading.budget or {})
             result = fit.refine(asset, batch, options=chosen, bar=True, interrupt=reading.interrupt, **budget)
         progress.report(result.notes)

@@ -63,8 +63,9 @@ def parser() -> argparse.ArgumentParser:
         "--background",
         choices=("auto", "masked", "visible"),
         default="masked",
-        help="input of the lighting estimate: masked: the object only; visible: also the background (published "
-        "network); auto: visible if all views have a background and the weights were trained with it (default masked)",
+        help="input of the lighting estimate: masked: the object only; visible: also the background, which must be far "
+        "away (published network, --refine); auto: visible to the network if all views have a background and it was "
+        "trained with them (default masked)",
     )
     p.add_argument("--up", choices=AXES, default="y", help="axis of the cameras' world frame that becomes +Y")
     p.add_argument(

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from reli3d.fit.input_images import SATURATED_LINEAR
-from reli3d.fit.unknowns import Unknowns, light_maps
+from reli3d.fit.unknowns import Start, Unknowns, light_maps
+from reli3d.render.latlong import texel_solid_angles
 
 MIN_LINEAR = 0.02  # linear radiance below which the display's derivative is constant: there images contain mostly noise
 HUBER_DELTA = 0.25  # display values; larger residuals count linearly: reflected surroundings, glare, wrong masks
@@ -31,12 +32,13 @@ class Weights:
     sdf_change: float = 2e-3  # of the squared change of the signed distance; divided by the number of views
     image: float = 1.0  # of :func:`display_error` in the fit of the maps and the lighting
     palette: float = 0.01  # of :func:`palette`
-    hue: float = 0.1  # of :func:`hue_drift`
+    hue: float = 0.1  # of :func:`hue_drift`; multiplied by the share of the lighting that no background shows
     base_coarse: float = 0.02  # pulls the base color's coarse field to the start; divided by the number of views
     base_color: float = 20.0  # of :func:`near_base_color`; over the 4th power of the number of views with used colors
     finish: float = 0.05  # pulls roughness and metallic to the start; divided by the number of views
     light: float = 3e-3  # pulls the lighting to the start
     light_variation: float = 2e-3  # of :func:`total_variation` of the lighting
+    background: float = 0.05  # of :func:`near_background`
     exposure: float = 0.1  # of squared log exposures; their mean is ambiguous with the scale of the lighting
     free_bend: float = 2e-3  # of the squared bend while the material is fitted; multiplied by the number of views
     bend: float = 20.0  # of the squared bend that is kept; divided by the squared number of views
@@ -152,3 +154,16 @@ def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
     light = weights.light * near_start(unknowns.light) + weights.light_variation * variation
     loss = loss + min(1.0, LIGHT_PRIOR_VIEWS * len(unknowns.light[0]) / views) ** 2 * light
     return loss + weights.exposure * unknowns.exposure.square().mean()
+
+
+def near_background(unknowns: Unknowns, start: Start) -> Tensor:
+    """Mean squared change of log radiance where ``start.seen``, over the sphere; 0 without it.
+
+    Where the background is saturated, only a decrease counts.
+    """
+    if start.seen is None or start.clipped is None:
+        return unknowns.exposure.new_zeros(())
+    change = light_maps(unknowns.light)
+    change = torch.where(start.clipped, change.clamp(max=0.0), change)
+    area = texel_solid_angles(*change.shape[1:3], change.device).to(change)[:, None, None]
+    return (start.seen * area * change.square()).sum() / (area.sum() * change.shape[2] * change.shape[3] * len(change))

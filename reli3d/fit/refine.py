@@ -12,6 +12,7 @@ from torch import Tensor
 
 from reli3d._bridge import full_precision, load_modules, present
 from reli3d.fit import losses
+from reli3d.fit.background import Background
 from reli3d.fit.bounce import gathered
 from reli3d.fit.budget import Budget, Part
 from reli3d.fit.choice import UNCHANGED, Fitted, Parts, chosen, mean_psnr, view_errors
@@ -42,6 +43,8 @@ class RefineOptions:
     resolution: of :func:`~reli3d.fit.shape.start_grid`.  cameras: optimize the poses as well.  light: of
     :meth:`InputImages.of`; unless ``object``, the result has the lighting of view 0.  light_chromaticity: weight of
     :func:`~reli3d.fit.light_hue.with_neutral_light`; 1 keeps the lighting of a start whose lighting is known.
+    background: images without crop, under the lighting ``light``, whose far background is used as lighting
+    (:class:`~reli3d.fit.background.Background`).
     """
 
     resolution: int = RESOLUTION
@@ -49,6 +52,7 @@ class RefineOptions:
     cameras: bool = False
     light: str | Sequence[Hashable] = "object"
     light_chromaticity: float = CHROMATICITY_WEIGHT
+    background: PosedImages | None = None
     seed: int = 0
 
 
@@ -159,7 +163,12 @@ def refine(
         advice = "if the lighting moves with it, set light to camera (flash) or turntable"
         notes.append(f"brightness varies with the camera; {advice}")
     with torch.random.fork_rng(devices=[]):
-        start = Start.of(first, rotations=None if rotations is None else rotations[used])
+        rotated = None if rotations is None else rotations[used]
+        start = Start.of(first, rotations=rotated)
+        if options.background is not None:
+            background = Background.of(InputImages.of(options.background, options.light))
+            first = background.scaled(first, start)
+            start = background.over(Start.of(first, rotations=rotated))
         data = FixedSurface(start, first, received, near, used)
         fitted = _fitted(data, options, budget, notes)
         kept, parts, after = chosen(fitted, used, list(held), before)

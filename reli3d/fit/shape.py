@@ -260,6 +260,7 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, error) -> Tenso
     logs = points.base_color.clamp(min=losses.MIN_LINEAR).log()
     loss = loss + weights.shading * weights.palette * losses.palette(logs, target)
     loss = loss + weights.shading * losses.near_base_color(change[:, :3], weights, len(data.colored))
+    loss = loss + weights.shading * weights.background * losses.near_background(unknowns, data.start)
     return loss + weights.shading * losses.priors(unknowns, weights, len(data.images))
 
 

@@ -19,7 +19,7 @@ from reli3d.geometry.camera import Camera
 from reli3d.render.asset import Asset
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
-from reli3d.render.latlong import lat_long_directions
+from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 from reli3d.render.points import SurfacePoints
 
 LOGIT_MARGIN = 0.005  # from 0 and 1 at which values are clamped before the logit
@@ -78,10 +78,26 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Start:
-    """Initial values: logits of the material on a grid ``(n, n, n, 5)`` and log radiance ``(h, 2h, 3)``."""
+    """Initial values: logits of the material on a grid ``(n, n, n, 5)`` and log radiance ``(h, 2h, 3)``.
+
+    seen: after :meth:`Background.over <reli3d.fit.background.Background.over>`, where ``light`` is ``(G, h, 2h, 3)``,
+    the share of each texel that images show, ``(G, h, 2h, 1)``.  clipped: ``(G, h, 2h, 3)`` bool, where their pixels
+    are saturated.
+    """
 
     material: Tensor
     light: Tensor
+    seen: Tensor | None = None
+    clipped: Tensor | None = None
+
+    @property
+    def unseen(self) -> float:
+        """Share of the sphere whose lighting no image shows, the mean over the lightings."""
+        if self.seen is None:
+            return 1.0
+        rows = self.seen.mean((0, 2, 3)).double()
+        angle = texel_solid_angles(len(rows), 2 * len(rows), rows.device)
+        return 1.0 - float((rows * angle).sum() / angle.sum())
 
     @classmethod
     def of(cls, asset: Asset, texels: int = 256, rotations: Tensor | None = None) -> Start:

@@ -80,7 +80,9 @@ def background_shown(views: Views, background: str, *, readable: bool) -> bool:
     if background not in BACKGROUNDS:
         raise InputError("background", f"expected {', '.join(BACKGROUNDS)}, got {background}")
     if background == "visible" and not readable:
-        raise InputError("background", "expected masked or auto, as the weights ignore it, got visible")
+        raise InputError(
+            "background", "expected masked or auto unless with --refine, as the weights ignore it, got visible"
+        )
     if background != "auto":
         return background == "visible"
     return readable and all(has_background(i, m) for i, m in zip(views.images, views.masks, strict=True))

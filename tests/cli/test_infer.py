@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from reli3d.cli import checking as check
 from reli3d.cli import infer
@@ -168,6 +169,25 @@ def test_weights_that_ignore_the_background_refuse_it(tmp_path, capsys):
     assert command(tmp_path, "--background", "visible") == 2
     assert "background: expected masked or auto" in capsys.readouterr().err
     assert not any((tmp_path / "out").glob("*/*"))
+
+
+def test_a_refinement_reads_the_background_or_refuses_cut_outs(tmp_path, capsys):
+    words = "--background", "visible", "--refine", "4steps"
+    assert command(tmp_path, *words) == 0
+    info = json.loads((tmp_path / "out" / "example" / "run_info.json").read_text())
+    assert info["background"] == "visible"
+    assert command(tmp_path / "masked", *words[2:]) == 0
+    seen, masked = (read_environment(tmp_path / k / "out/example/environment.exr").radiance for k in (".", "masked"))
+    assert float((seen.log() - masked.log()).abs().mean()) > 0.1  # four steps change less
+    capsys.readouterr()
+    for image in (cut_out := moved_example(tmp_path / "cut_out", torch.eye(4, dtype=torch.float64))).glob("rgba/*.png"):
+        bitmap = Image.open(image).convert("RGBA")
+        Image.composite(bitmap, Image.new("RGBA", bitmap.size), bitmap.getchannel("A")).save(image)
+    assert command(tmp_path / "no", cut_out, *words) == 2
+    assert "background: visible: expected images with a background, got a cut-out" in capsys.readouterr().err
+    assert command(tmp_path / "no", *words, "--light", "camera") == 2
+    assert "expected lighting that does not move with the camera" in capsys.readouterr().err
+    assert not any((tmp_path / "no" / "out").glob("*/*"))
 
 
 def test_a_negative_axis_may_be_a_word_of_its_own():
