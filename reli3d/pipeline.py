@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from reli3d.fit.refine import Refinement
 
 REFINED = 384  # pixels per side of the views that a refinement compares with
-BACKGROUND = 64  # pixels per side of the whole images whose background a refinement reads
+SURROUNDINGS = 256  # pixels per side of the uncropped images whose background a refinement reads
 MAX_CROP_PIXELS = 3 << 23  # of all photographs whose detail is added: 100 MB during the fit
 LEAST_REFINED = 3  # views with the complete object from which a refinement leaves out the others
 INSIDE = 2.0  # pixels from the silhouette within which colors may be mixed with the background
@@ -404,10 +404,10 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     small tolerance; if none, the result is ``asset``.  Then :mod:`reli3d.fit.fine_detail` follows.
 
     views: in the frame of ``asset``; those that cut the object off are left out while three others remain.  seconds,
-    steps: exactly one; with ``steps`` the result is reproducible.  background: ``masked``, or ``visible`` if the views
-    show a far background, which is then used as lighting.  options: see :class:`reli3d.fit.refine.RefineOptions`.  The
-    result has no gradients.  Raises TypeError for a wrong type, ValueError for both or no budget, InputError if a view
-    lacks the ``visible`` background.
+    steps: exactly one; with ``steps`` the result is reproducible.  background: ``masked``, or ``visible`` if the views,
+    loaded with ``whole=True``, show a far background, which is then used as lighting.  options: see
+    :class:`reli3d.fit.refine.RefineOptions`.  The result has no gradients.  Raises TypeError for a wrong type,
+    ValueError for both or no budget, InputError if no view has the ``visible`` background.
 
     >>> views = reli3d.load_views("photos/shoe", every=True)
     >>> asset = reli3d.refine(reli3d.reconstruct(views.taken()), views, seconds=60)
@@ -418,28 +418,32 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     expect("asset", asset, Asset)
     expect("views", views, Views)
     Budget(seconds, steps)  # raises ValueError
+    if background not in ("masked", "visible"):
+        raise InputError("background", f"expected masked or visible, got {background}")
     options = {"light": views.lighting, **options}
     views, options["light"] = _complete_views(views, options["light"])
     views = views.to(asset.mesh.vertices.device)
-    if background not in ("masked", "visible"):
-        raise InputError("background", f"expected masked or visible, got {background}")
     if background == "visible":
-        options["background"] = _with_surroundings(views, options["light"])
+        options["surroundings"] = _surroundings(views, options["light"])
     batch = views.resampled(REFINED, linear=True)
     result = fit.refine(asset, batch, seconds=seconds, steps=steps, options=fit.RefineOptions(**options))
     return _with_detail(result, _detail_crops(views, present("asset.textures", asset.textures).size))[0]
 
 
-def _with_surroundings(views: Views, light: str | Sequence) -> ViewBatch:
-    """The views without crop, for ``RefineOptions.background``.  Raises InputError if one has no background."""
+def _surroundings(views: Views, light: str | Sequence) -> ViewBatch:
+    """The uncropped views for ``RefineOptions.surroundings``; those without a background are masked completely.
+
+    Raises InputError if none has one, or for lighting that moves with the camera.
+    """
+    fix = "use background masked or auto"
     if light == "camera":
-        raise InputError(
-            "background", "visible: expected lighting that does not move with the camera, got light camera"
-        )
-    for name, image, mask in zip(views.names, views.images, views.masks, strict=True):
-        if not has_background(image, mask):
-            raise InputError("background", f"visible: expected images with a background, got a cut-out, {name}")
-    return views.resampled(BACKGROUND, crop=False, linear=True)
+        raise InputError("background", f"expected lighting that does not move with the camera for visible; {fix}")
+    batch = views.resampled(SURROUNDINGS, crop=False, linear=True)
+    usable = [has_background(*of_view) for of_view in zip(views.images, views.masks, strict=True)]
+    if not any(usable):
+        raise InputError("background", f"expected content outside the masks for visible, got one color or none; {fix}")
+    batch.masks[[not has for has in usable]] = 1.0
+    return batch
 
 
 def _detail_crops(views: Views, texels: int) -> list[Crop]:
@@ -548,7 +552,10 @@ def reconstruct_folder(
 
     watch = Stopwatch(model.device, progress)
     with watch.stage("reading"):
-        whole = published_input(model.preset) or (_reads_background(model) and options.background != "masked")
+        visible = bool(reading.budget) and options.background == "visible"
+        whole = (
+            published_input(model.preset) or visible or (_reads_background(model) and options.background != "masked")
+        )
         photographs = reading.read(folder, whole=whole)
         views, batch, around = photographs.taken(), None, None
         if reading.budget:
@@ -557,8 +564,8 @@ def reconstruct_folder(
                 note = f"refinement: {left_out} images that cut the object off are left out"
                 views = replace(views, notes=(*views.notes, note))
             batch, names = complete.resampled(REFINED, linear=True), complete.names
-            if options.background == "visible":
-                around = _with_surroundings(complete, light)
+            if visible:
+                around = _surroundings(complete, light)
             crops = _detail_crops(complete, options.texture_size)
             del complete
         del photographs  # 1 GB of 60 images of 1 MP
@@ -583,7 +590,7 @@ def reconstruct_folder(
             batch = replace(batch, c2w=output.of_cameras(batch.c2w)).to(model.device)
             if around is not None:
                 around = replace(around, c2w=output.of_cameras(around.c2w)).to(model.device)
-            chosen = fit.RefineOptions(light=light, cameras=reading.cameras, background=around)
+            chosen = fit.RefineOptions(light=light, cameras=reading.cameras, surroundings=around)
             budget: dict[str, Any] = dict(reading.budget or {})
             result = fit.refine(asset, batch, options=chosen, bar=True, interrupt=reading.interrupt, **budget)
         progress.report(result.notes)

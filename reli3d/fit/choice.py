@@ -32,7 +32,7 @@ SURFACE_TOLERANCES_DB = (0.1, 0.3, 0.05)
 
 @dataclass(frozen=True)
 class Parts:
-    """Blend weights between start (0), with less saturated lighting (:mod:`reli3d.fit.light_hue`), and fit (1).
+    """Blend weights between start (0), with the lighting of :mod:`reli3d.fit.light_hue`, and fit (1).
 
     surface: 0 or 1.  material: factor on the changes of material logits and on the bend of the normals.  light: factor
     on the changes of log radiance.

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from reli3d.render.asset import Asset
 from reli3d.render.environment import Environment
@@ -31,7 +32,11 @@ def with_neutral_light(asset: Asset, weight: float = CHROMATICITY_WEIGHT) -> Ass
     angle = texel_solid_angles(*radiance.shape[:2]).to(radiance)[:, None, None]
     color = ((angle * radiance).sum((0, 1)) / (4.0 * math.pi)).clamp(min=MIN_RADIANCE).log()
     factor = ((weight - 1.0) * (color - color.mean())).exp().clamp(1.0 / MAX_FACTOR, MAX_FACTOR)
-    base_color = (asset.textures.base_color / factor).clamp(max=1.0)
-    return replace(
-        asset, textures=replace(asset.textures, base_color=base_color), environment=Environment(radiance * factor)
-    )
+    return with_scaled_light(asset, factor)
+
+
+@torch.no_grad()
+def with_scaled_light(asset: Asset, factor: Tensor) -> Asset:
+    """``asset`` with its lighting times ``factor (3,)`` and its base color divided by it, clipped at 1."""
+    textures = replace(asset.textures, base_color=(asset.textures.base_color / factor).clamp(max=1.0))
+    return replace(asset, textures=textures, environment=Environment(asset.light.radiance * factor))

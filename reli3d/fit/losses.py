@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -32,7 +33,7 @@ class Weights:
     sdf_change: float = 2e-3  # of the squared change of the signed distance; divided by the number of views
     image: float = 1.0  # of :func:`display_error` in the fit of the maps and the lighting
     palette: float = 0.01  # of :func:`palette`
-    hue: float = 0.1  # of :func:`hue_drift`; multiplied by the share of the lighting that no background shows
+    hue: float = 0.1  # of :func:`hue_drift`; multiplied by the unobserved fraction of the lighting
     base_coarse: float = 0.02  # pulls the base color's coarse field to the start; divided by the number of views
     base_color: float = 20.0  # of :func:`near_base_color`; over the 4th power of the number of views with used colors
     finish: float = 0.05  # pulls roughness and metallic to the start; divided by the number of views
@@ -157,13 +158,13 @@ def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
 
 
 def near_background(unknowns: Unknowns, start: Start) -> Tensor:
-    """Mean squared change of log radiance where ``start.seen``, over the sphere; 0 without it.
+    """Squared change of log radiance times ``start.observed``, mean over the sphere, channels and lightings.
 
-    Where the background is saturated, only a decrease counts.
+    Where the background is saturated, only a decrease counts.  0 without a background.
     """
-    if start.seen is None or start.clipped is None:
+    if start.observed is None or start.clipped is None:
         return unknowns.exposure.new_zeros(())
     change = light_maps(unknowns.light)
     change = torch.where(start.clipped, change.clamp(max=0.0), change)
     area = texel_solid_angles(*change.shape[1:3], change.device).to(change)[:, None, None]
-    return (start.seen * area * change.square()).sum() / (area.sum() * change.shape[2] * change.shape[3] * len(change))
+    return (start.observed * area * change.square()).sum() / (4.0 * math.pi * change.shape[3] * len(change))

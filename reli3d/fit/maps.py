@@ -137,7 +137,7 @@ def maps_loss(
     colors = points.base_color, material_of(pixels.logits[rows])[0]
     color, was = (c.clamp(min=losses.MIN_LINEAR).log() for c in colors)
     loss = loss + weights.palette * losses.palette(color, target)
-    loss = loss + weights.hue * data.start.unseen * losses.hue_drift(color, was)
+    loss = loss + weights.hue * data.start.unobserved * losses.hue_drift(color, was)
     loss = loss + losses.priors(unknowns, weights, len(data.used))
     loss = loss + weights.background * losses.near_background(unknowns, data.start)
     loss = loss + losses.near_base_color(change[:, :3], weights, len(data.used))

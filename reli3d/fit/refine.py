@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 import torch
 from torch import Tensor
 
-from reli3d._bridge import full_precision, load_modules, present
+from reli3d._bridge import check, full_precision, load_modules, present
 from reli3d.fit import losses
 from reli3d.fit.background import Background
 from reli3d.fit.bounce import gathered
@@ -43,8 +43,8 @@ class RefineOptions:
     resolution: of :func:`~reli3d.fit.shape.start_grid`.  cameras: optimize the poses as well.  light: of
     :meth:`InputImages.of`; unless ``object``, the result has the lighting of view 0.  light_chromaticity: weight of
     :func:`~reli3d.fit.light_hue.with_neutral_light`; 1 keeps the lighting of a start whose lighting is known.
-    background: images without crop, under the lighting ``light``, whose far background is used as lighting
-    (:class:`~reli3d.fit.background.Background`).
+    surroundings: the uncropped images of all views, whose background, assumed far away, initializes and constrains the
+    lighting (:class:`~reli3d.fit.background.Background`); not with ``light="camera"``.
     """
 
     resolution: int = RESOLUTION
@@ -52,7 +52,7 @@ class RefineOptions:
     cameras: bool = False
     light: str | Sequence[Hashable] = "object"
     light_chromaticity: float = CHROMATICITY_WEIGHT
-    background: PosedImages | None = None
+    surroundings: PosedImages | None = None
     seed: int = 0
 
 
@@ -134,8 +134,11 @@ def refine(
     Nothing has gradients.  Raises TypeError or ValueError for mismatched shapes or devices, an invalid ``light`` or
     budget, or an asset without environment, textures, normals, UV or faces.
     """
-    images = InputImages.of(views, options.light)
+    images, background = InputImages.of(views, options.light), None
     _check_asset(asset, images)
+    if options.surroundings is not None:
+        check("surroundings.images", options.surroundings.images, like=images.color)
+        background = Background.of(InputImages.of(options.surroundings, options.light))
     device = images.color.device
     kernels = cache.imported(device.type)
     if not cache.compiled(kernels, device.type):  # it takes up to half a minute, which is not part of the budget
@@ -165,8 +168,7 @@ def refine(
     with torch.random.fork_rng(devices=[]):
         rotated = None if rotations is None else rotations[used]
         start = Start.of(first, rotations=rotated)
-        if options.background is not None:
-            background = Background.of(InputImages.of(options.background, options.light))
+        if background is not None:
             first = background.scaled(first, start)
             start = background.over(Start.of(first, rotations=rotated))
         data = FixedSurface(start, first, received, near, used)

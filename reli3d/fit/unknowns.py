@@ -7,7 +7,7 @@ metallic; logarithms of radiance): zero is the start, and every value is valid.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial, reduce
+from functools import cached_property, partial, reduce
 
 import torch
 from torch import Tensor
@@ -80,22 +80,22 @@ class Unknowns:
 class Start:
     """Initial values: logits of the material on a grid ``(n, n, n, 5)`` and log radiance ``(h, 2h, 3)``.
 
-    seen: after :meth:`Background.over <reli3d.fit.background.Background.over>`, where ``light`` is ``(G, h, 2h, 3)``,
-    the share of each texel that images show, ``(G, h, 2h, 1)``.  clipped: ``(G, h, 2h, 3)`` bool, where their pixels
-    are saturated.
+    observed: after :meth:`Background.over <reli3d.fit.background.Background.over>`, where ``light`` is ``(G, h, 2h,
+    3)``, the fraction of each texel that the background of the images covers, ``(G, h, 2h, 1)``.  clipped: ``(G, h, 2h,
+    3)`` bool, where it is saturated.
     """
 
     material: Tensor
     light: Tensor
-    seen: Tensor | None = None
+    observed: Tensor | None = None
     clipped: Tensor | None = None
 
-    @property
-    def unseen(self) -> float:
-        """Share of the sphere whose lighting no image shows, the mean over the lightings."""
-        if self.seen is None:
+    @cached_property
+    def unobserved(self) -> float:
+        """Fraction of the sphere whose lighting no background shows, mean over the lightings."""
+        if self.observed is None:
             return 1.0
-        rows = self.seen.mean((0, 2, 3)).double()
+        rows = self.observed.mean((0, 2, 3)).double()
         angle = texel_solid_angles(len(rows), 2 * len(rows), rows.device)
         return 1.0 - float((rows * angle).sum() / angle.sum())
 

@@ -184,7 +184,7 @@ def test_a_refinement_reads_the_background_or_refuses_cut_outs(tmp_path, capsys)
         bitmap = Image.open(image).convert("RGBA")
         Image.composite(bitmap, Image.new("RGBA", bitmap.size), bitmap.getchannel("A")).save(image)
     assert command(tmp_path / "no", cut_out, *words) == 2
-    assert "background: visible: expected images with a background, got a cut-out" in capsys.readouterr().err
+    assert "background: expected content outside the masks for visible" in capsys.readouterr().err
     assert command(tmp_path / "no", *words, "--light", "camera") == 2
     assert "expected lighting that does not move with the camera" in capsys.readouterr().err
     assert not any((tmp_path / "no" / "out").glob("*/*"))
