@@ -166,5 +166,6 @@ def near_background(unknowns: Unknowns, start: Start) -> Tensor:
         return unknowns.exposure.new_zeros(())
     change = light_maps(unknowns.light)
     change = torch.where(start.clipped, change.clamp(max=0.0), change)
-    area = texel_solid_angles(*change.shape[1:3], change.device).to(change)[:, None, None]
-    return (start.observed * area * change.square()).sum() / (4.0 * math.pi * change.shape[3] * len(change))
+    groups, rows, _, channels = change.shape
+    area = texel_solid_angles(rows, 2 * rows, change.device).to(change)[:, None, None]
+    return (start.observed * area * change.square()).sum() / (4.0 * math.pi * channels * groups)
