@@ -18,6 +18,7 @@ from reli3d.io.hdr import read_environment
 from reli3d.output import results
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.image import render_asset
+from reli3d.render.latlong import lat_long_directions
 from reli3d.views.folder import load_views
 from tests.support import hostile
 from tests.support.example import EXAMPLE, QUICK, moved_example
@@ -179,6 +180,11 @@ def test_a_refinement_reads_the_background_or_refuses_cut_outs(tmp_path, capsys)
     assert command(tmp_path / "masked", *words[2:]) == 0
     seen, masked = (read_environment(tmp_path / k / "out/example/environment.exr").radiance for k in (".", "masked"))
     assert float((seen.log() - masked.log()).abs().mean()) > 0.1  # four steps change less
+    assert command(tmp_path / "z", *words, "--up", "z") == 0  # the lighting turns with the object
+    turned = read_environment(tmp_path / "z/out/example/environment.exr")
+    directions = lat_long_directions(32)
+    turned = turned.lookup(torch.stack([directions[..., 0], directions[..., 2], -directions[..., 1]], -1).contiguous())
+    assert float((seen.log() - turned.log()).abs().median()) < 0.1  # 0.6 if it does not
     capsys.readouterr()
     for image in (cut_out := moved_example(tmp_path / "cut_out", torch.eye(4, dtype=torch.float64))).glob("rgba/*.png"):
         bitmap = Image.open(image).convert("RGBA")
