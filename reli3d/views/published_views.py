@@ -81,7 +81,7 @@ def background_shown(views: Views, background: str, *, readable: bool) -> bool:
         raise InputError("background", f"expected {', '.join(BACKGROUNDS)}, got {background}")
     if background == "visible" and not readable:
         raise InputError(
-            "background", "expected masked or auto, got visible, which only a refinement reads with these weights"
+            "background", "expected masked or auto, as only a refinement reads it with these weights, got visible"
         )
     if background != "auto":
         return background == "visible"

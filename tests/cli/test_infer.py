@@ -173,18 +173,16 @@ def test_weights_that_ignore_the_background_refuse_it(tmp_path, capsys):
 
 
 def test_a_refinement_reads_the_background_or_refuses_cut_outs(tmp_path, capsys):
-    words = "--background", "visible", "--refine", "4steps"
+    words = "--background", "visible", "--views", "4", "--refine", "3steps"
     assert command(tmp_path, *words) == 0
     info = json.loads((tmp_path / "out" / "example" / "run_info.json").read_text())
     assert info["background"] == "visible"
-    assert command(tmp_path / "masked", *words[2:]) == 0
-    seen, masked = (read_environment(tmp_path / k / "out/example/environment.exr").radiance for k in (".", "masked"))
-    assert float((seen.log() - masked.log()).abs().mean()) > 0.1  # four steps change less
     assert command(tmp_path / "z", *words, "--up", "z") == 0  # the lighting turns with the object
+    first = read_environment(tmp_path / "out/example/environment.exr").radiance
     turned = read_environment(tmp_path / "z/out/example/environment.exr")
     directions = lat_long_directions(32)
     turned = turned.lookup(torch.stack([directions[..., 0], directions[..., 2], -directions[..., 1]], -1).contiguous())
-    assert float((seen.log() - turned.log()).abs().median()) < 0.1  # 0.6 if it does not
+    assert float((first.log() - turned.log()).abs().median()) < 0.1
     capsys.readouterr()
     for image in (cut_out := moved_example(tmp_path / "cut_out", torch.eye(4, dtype=torch.float64))).glob("rgba/*.png"):
         bitmap = Image.open(image).convert("RGBA")
