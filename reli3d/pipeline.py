@@ -399,13 +399,12 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
            background: str = "masked", **options) -> Asset:  # fmt: skip
     """Refines mesh, maps and lighting of ``asset`` by inverse rendering of ``views``.
 
-    The colors of :func:`reli3d.fit.refine.held_out` views are held out.  Material and lighting are each blended between
-    start and fit with the first weights for which no mean PSNR (fitted, held-out, all views) is below the start's, with
-    small tolerance; if none, the result is ``asset``.  Then :mod:`reli3d.fit.fine_detail` follows.
+    Keeps the first blend of start and fit whose errors (:func:`~reli3d.fit.choice.chosen`) do not exceed the start's;
+    if none, ``asset``.  Then :mod:`reli3d.fit.fine_detail` follows.
 
     views: in the frame of ``asset``; those that cut the object off are left out while three others remain.  seconds,
-    steps: exactly one; with ``steps`` the result is reproducible.  background: ``masked``, or ``visible`` if the views,
-    loaded with ``whole=True``, show a far background, which is then used as lighting.  options: see
+    steps: exactly one; with ``steps`` the result is reproducible.  background: ``visible`` uses the far background of
+    ``views``, loaded with ``whole=True``, as lighting; or ``masked``.  options: see
     :class:`reli3d.fit.refine.RefineOptions`.  The result has no gradients.  Raises TypeError for a wrong type,
     ValueError for both or no budget, InputError if no view has the ``visible`` background.
 
