@@ -19,9 +19,9 @@ from reli3d.render.transfer import spherical_harmonics
 COMPARED_POINTS, COMPARED_VIEWS = 4096, 64  # at most; memory is quadratic in the views
 SATURATED_DISPLAY = 0.98  # a brighter value may be clipped
 HARMONICS = slice(1, 9)  # of degree 1 and 2; with degree 0 they hold 99 % of a light's irradiance
-# Above both limits the lighting counts as moving with the camera.  Measured with 12 to 60 views: fixed lighting (10
-# objects) up to 0.20 with ratio 0.6 to 1.6, and below 0.06 up to 1.8; moving lighting 0.10 to 0.85 and 1.0 to 5.0.
-MIN_DEVIATION, MIN_RATIO = 0.08, 1.8
+# Above both limits the lighting counts as moving with the camera.  Measured with 12 to 48 views: fixed lighting (13
+# objects) up to 0.18 with ratio 0.4 to 1.4, and below 0.08 up to 3.8; moving lighting (3) 0.05 to 0.18, 1.7 to 4.0.
+MIN_DEVIATION, MIN_RATIO = 0.08, 1.6
 
 
 def light_follows_camera(mesh: Mesh, images: InputImages) -> bool:
@@ -37,8 +37,9 @@ def explained_deviations(mesh: Mesh, images: InputImages) -> tuple[float, float]
     Under lighting fixed to the camera, log radiance is fitted as a function of the normal in camera axes (diffuse
     points); under lighting fixed to the object, as one of the reflected direction in object axes (glossy points).  Each
     function is a sum of spherical harmonics of degree 1 and 2, fitted by weighted least squares (visibility, viewing
-    angle) with a constant for each point and each view (albedo, exposure).  The explained deviation is the square root
-    of the variance that the function removes.
+    angle) with a constant for each point and each view (albedo, exposure) and Schlick's Fresnel term, which brightens
+    grazing angles under any lighting.  The explained deviation is the square root of the variance that the function
+    removes.
 
     mesh: with normals.  No gradient.
     """
@@ -54,9 +55,11 @@ def explained_deviations(mesh: Mesh, images: InputImages) -> tuple[float, float]
     wo, n = unit(images.camera.c2w[None, :, :3, 3] - position[:, None]), normal[:, None]
     reflected = reflect(wo, n)
     views = torch.eye(len(images), device=normal.device, dtype=torch.float32).expand(len(normal), -1, -1)
+    fresnel = (1.0 - (wo * n).sum(-1, keepdim=True).clamp(0.0, 1.0)) ** 5
+    common = torch.cat([views, fresnel], -1)
     harmonics = [spherical_harmonics(d)[..., HARMONICS] for d in (turned, reflected)]
-    constant = _residual(bright, [views], weight)
-    camera, object_ = (max(0.0, constant - _residual(bright, [views, h], weight)) ** 0.5 for h in harmonics)
+    constant = _residual(bright, [common], weight)
+    camera, object_ = (max(0.0, constant - _residual(bright, [common, h], weight)) ** 0.5 for h in harmonics)
     return camera, object_
 
 

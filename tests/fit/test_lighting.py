@@ -21,6 +21,7 @@ from reli3d.fit.transfer import changed
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.rays import RayScene
+from reli3d.render.asset import TextureSet
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import primary_hits
@@ -191,6 +192,14 @@ def test_light_that_moves_with_the_camera_is_detected():
     assert fixed[0] < 0.05 and not light_follows_camera(mesh, shaded(False))
     exposure = torch.linspace(0.4, 1.0, 16)[:, None, None, None]  # is a constant of each view
     assert explained_deviations(mesh, shaded(False, exposure))[0] == pytest.approx(fixed[0], abs=0.03)
+
+
+def test_fresnel_reflection_at_grazing_angles_does_not_count_as_moving_light():
+    ball = small_scene.ball()
+    dark = replace(ball, textures=TextureSet(torch.full_like(ball.textures.base_color, 0.1), 0.4, 0.0))
+    images = InputImages.of(small_scene.input_views(dark, 16, 48))
+    assert explained_deviations(ball.mesh, images)[0] < 0.08  # 0.18 without the Fresnel term
+    assert not light_follows_camera(ball.mesh, images)
 
 
 @pytest.mark.parametrize("count, cells", [(130, 24), (12, 50)])
