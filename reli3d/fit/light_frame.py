@@ -20,7 +20,7 @@ COMPARED_POINTS, COMPARED_VIEWS = 4096, 64  # at most; memory is quadratic in th
 SATURATED_DISPLAY = 0.98  # a brighter value may be clipped
 HARMONICS = slice(1, 9)  # of degree 1 and 2; with degree 0 they hold 99 % of a light's irradiance
 # Above both limits the lighting counts as moving with the camera.  Measured with 12 to 48 views: fixed lighting (13
-# objects) up to 0.18 with ratio 0.4 to 1.4, and below 0.08 up to 3.8; moving lighting (3) 0.05 to 0.18, 1.7 to 4.0.
+# objects) up to 0.18 with ratio 0.4 to 1.4, and below 0.08 up to 3.8; moving lighting (3) 0.05 to 0.18, 1.8 to 4.1.
 MIN_DEVIATION, MIN_RATIO = 0.08, 1.6
 
 
