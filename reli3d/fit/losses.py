@@ -33,8 +33,7 @@ class Weights:
     sdf_change: float = 2e-3  # of the squared change of the signed distance; divided by the number of views
     image: float = 1.0  # of :func:`display_error` in the fit of the maps and the lighting
     palette: float = 0.01  # of :func:`palette`
-    hue: float = 0.1  # of :func:`hue_drift`; multiplied by the unobserved fraction of the lighting
-    base_coarse: float = 0.02  # pulls the base color's coarse field to the start; divided by the number of views
+    base_coarse: float = 0.005  # pulls the base color's coarse field to the start; divided by the number of views
     base_color: float = 20.0  # of :func:`near_base_color`; over the 4th power of the number of views with used colors
     finish: float = 0.05  # pulls roughness and metallic to the start; divided by the number of views
     light: float = 3e-3  # pulls the lighting to the start
@@ -130,17 +129,6 @@ def palette(color: Tensor, tint: Tensor) -> Tensor:
     similarity = torch.exp(-(logs - logs.roll(1, 0)).square().sum(1) / (2.0 * CHROMATICITY_SIGMA * CHROMATICITY_SIGMA))
     square = (color - color.roll(1, 0)).square().mean(1)
     return (similarity * square / (square + PALETTE_SCALE * PALETTE_SCALE)).mean()
-
-
-def hue_drift(color: Tensor, start: Tensor) -> Tensor:
-    """Squared change of the object's mean chromaticity, in log base color.
-
-    color, start: ``(N, 3)`` logarithms of base color at the same points.  A factor per channel is ambiguous between
-    base color and lighting; the start, predicted from learned priors, resolves this.  Brightness is not constrained,
-    because the start's is often wrong.
-    """
-    drift = (color - start).mean(0)
-    return (drift - drift.mean()).square().mean()
 
 
 def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:

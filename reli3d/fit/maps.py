@@ -134,10 +134,8 @@ def maps_loss(
         return (bounced + lights.evaluate(points, pixels.wo[rows], view, partial(direct, seed=seed))) * exposure
 
     loss = weights.image * losses.estimated_error(lit, target, seed, independent)
-    colors = points.base_color, material_of(pixels.logits[rows])[0]
-    color, was = (c.clamp(min=losses.MIN_LINEAR).log() for c in colors)
+    color = points.base_color.clamp(min=losses.MIN_LINEAR).log()
     loss = loss + weights.palette * losses.palette(color, target)
-    loss = loss + weights.hue * data.start.unobserved * losses.hue_drift(color, was)
     loss = loss + losses.priors(unknowns, weights, len(data.used))
     loss = loss + weights.background * losses.near_background(unknowns, data.start)
     loss = loss + losses.near_base_color(change[:, :3], weights, len(data.used))

@@ -7,7 +7,7 @@ metallic; logarithms of radiance): zero is the start, and every value is valid.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial, reduce
+from functools import partial, reduce
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from reli3d.geometry.camera import Camera
 from reli3d.render.asset import Asset
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
-from reli3d.render.latlong import lat_long_directions, texel_solid_angles
+from reli3d.render.latlong import lat_long_directions
 from reli3d.render.points import SurfacePoints
 
 LOGIT_MARGIN = 0.005  # from 0 and 1 at which values are clamped before the logit
@@ -89,15 +89,6 @@ class Start:
     light: Tensor
     observed: Tensor | None = None
     clipped: Tensor | None = None
-
-    @cached_property
-    def unobserved(self) -> float:
-        """Fraction of the sphere whose lighting no background shows, mean over the lightings."""
-        if self.observed is None:
-            return 1.0
-        rows = self.observed.mean((0, 2, 3)).double()
-        angle = texel_solid_angles(len(rows), 2 * len(rows), rows.device)
-        return 1.0 - float((rows * angle).sum() / angle.sum())
 
     @classmethod
     def of(cls, asset: Asset, texels: int = 256, rotations: Tensor | None = None) -> Start:

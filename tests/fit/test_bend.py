@@ -15,7 +15,6 @@ from reli3d.fit.transfer import changed
 from reli3d.fit.unknowns import MAX_BEND, Start, Unknowns, bent, unit
 from reli3d.geometry.bake import rasterize_texels
 from reli3d.geometry.hits import interpolate
-from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from tests.support import small_scene
 
@@ -60,20 +59,6 @@ def test_waves_of_the_normals_are_baked_into_the_base_color_less(start, images):
     options = Weights(palette=0.0), Weights(palette=0.0, free_bend=1e6, bend=1e6)
     free, unbent = (patches(changed(start, fitted(start, images, weights))) for weights in options)
     assert free < 0.9 * unbent
-
-
-def hue(asset) -> torch.Tensor:
-    """Mean logarithm of the base color ``(3,)`` without its brightness."""
-    color = small_scene.centers(asset).base_color.log().mean(0)
-    return color - color.mean()
-
-
-def test_a_light_of_another_color_leaves_the_hue_of_the_base_color(start, images):
-    # the start's base color has the true hue; its light is yellow, that of the images blue
-    other = replace(start, environment=Environment(start.environment.radiance * torch.tensor([1.6, 1.0, 0.5])))
-    results = (changed(other, fitted(other, images, weights)) for weights in (Weights(), Weights(hue=0.0)))
-    held, free = (float((hue(result) - hue(start)).norm()) for result in results)
-    assert held < 0.5 * free
 
 
 def test_the_bend_is_written_into_the_normal_map(start):

@@ -17,7 +17,7 @@ from reli3d.fit.bounce import gathered
 from reli3d.fit.budget import Budget, Part
 from reli3d.fit.choice import PSNR_TOLERANCE_DB, Fitted, Parts
 from reli3d.fit.input_images import InputImages
-from reli3d.fit.losses import LIGHT_PRIOR_VIEWS, Weights, agreement, display_error, hue_drift, palette, priors
+from reli3d.fit.losses import LIGHT_PRIOR_VIEWS, Weights, agreement, display_error, palette, priors
 from reli3d.fit.maps import FixedSurface, fit_maps
 from reli3d.fit.transfer import transfer_textures
 from reli3d.fit.unknowns import Start, Unknowns, corrected
@@ -64,8 +64,8 @@ def test_a_small_scene_is_recovered(refined, start):
     expected = srgb_to_linear(torch.tensor([[0.8, 0.25, 0.2], [0.25, 0.6, 0.3]]))
     # a factor per channel is ambiguous between base color and light; the ratio of the halves is not
     error = ((got[0] / got[1]).log() - (expected[0] / expected[1]).log()).abs()
-    # measured 0.63 of the error of gray: 60 steps are few, and the palette draws colors together at first
-    assert float(error.max()) < 0.65 * float((expected[0] / expected[1]).log().abs().max())
+    # measured 0.44 of the error of gray: 60 steps are few, and the prior pulls the base color to the gray start
+    assert float(error.max()) < 0.55 * float((expected[0] / expected[1]).log().abs().max())
 
 
 def test_few_views_fit_the_light_and_keep_the_base_color(views):
@@ -303,14 +303,6 @@ def test_the_palette_merges_shades_and_keeps_distinct_base_colors():
     assert pull[0] > 10 * pull[1]
     tinted = torch.tensor([[0.9, 0.2, 0.2], [0.2, 0.2, 0.9]])
     assert float(palette(near, tinted)) < 1e-3 * float(palette(near, torch.ones_like(near)))
-
-
-def test_the_mean_hue_is_held_and_neither_brightness_nor_patterns():
-    start = torch.randn(1000, 3, generator=torch.Generator().manual_seed(2))
-    pattern = torch.cat([torch.ones(500, 3), -torch.ones(500, 3)]) * torch.tensor([1.0, 0.0, -1.0])
-    assert float(hue_drift(start - 0.7 + pattern, start)) < 1e-9
-    # a factor of e on red alone: drifts of 2/3, -1/3 and -1/3, mean square (4 + 1 + 1) / 27
-    assert float(hue_drift(start + torch.tensor([1.0, 0.0, 0.0]), start)) == pytest.approx(6 / 27, rel=1e-5)
 
 
 def test_priors_of_the_lighting_fall_with_the_squared_number_of_views_per_lighting():
