@@ -12,6 +12,7 @@ import errno
 import hashlib
 import os
 import shutil
+import stat
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
@@ -144,7 +145,13 @@ def sibling(path: Path, before: str, after: str) -> Path:
 def _locked(work: Path, folder: Path) -> int:
     """Descriptor of the lock in ``work``, which this process now holds.  Raises OSError where another one does."""
     while True:
-        work.mkdir(parents=True, exist_ok=True)  # another process may have removed the empty parent
+        try:
+            work.mkdir(parents=True, exist_ok=True)  # another process may have removed the empty parent
+        except FileExistsError:
+            with contextlib.suppress(FileNotFoundError):  # another process removed it before mkdir looked what it is
+                if not stat.S_ISDIR(os.lstat(work).st_mode):
+                    raise
+            continue
         try:
             lock = os.open(work / "lock", os.O_RDWR | os.O_CREAT)
         except FileNotFoundError:  # another process has just removed it

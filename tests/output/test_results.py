@@ -1,6 +1,7 @@
 """A result folder changes at once: whatever is killed, whenever, the old result is there or the new one."""
 
 import contextlib
+import errno
 import os
 import signal
 import subprocess
@@ -140,6 +141,20 @@ def test_of_two_processes_one_reports_it_at_its_start(tmp_path):
         for name in OURS:
             (new / name).write_text("first")
     assert words(folder) == {"first"} and [p.name for p in tmp_path.iterdir()] == ["name"]
+
+
+def test_a_folder_that_another_process_removes_meanwhile_is_made_again(tmp_path, monkeypatch):
+    made, make = [], os.mkdir
+
+    def removed_meanwhile(path, *args):
+        made.append(Path(path).name)
+        if made.count(".name.partial") == 1 and made[-1] == ".name.partial":
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), path)
+        make(path, *args)
+
+    monkeypatch.setattr(os, "mkdir", removed_meanwhile)
+    put(tmp_path / "name", "new")
+    assert made.count(".name.partial") == 2 and words(tmp_path / "name") == {"new"}
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs locks of files")
